@@ -1,0 +1,1 @@
+"""Config-driven calibration studies built on `sfm_calib`."""

@@ -1,0 +1,169 @@
+"""`calibration.json`: the one result file that every command reads and writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from graphs.frames import Transform
+from graphs.lenses import PARAMETER_NAMES, Camera, LensName
+from sfm_calib.errors import CalibrationError
+from sfm_calib.files import write_atomically
+
+FORMAT = "sfm_calib/1"
+
+
+class Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CameraResult(Record):
+    """One camera. `sigma` and `prior_share` are empty where nothing was estimated (a truth)."""
+
+    lens: LensName
+    size: tuple[int, int]  # width, height in px
+    params: dict[str, float]  # OpenCV's names; pixel centres at integers
+    sigma: dict[str, float] = {}
+    prior_share: dict[str, float] = {}  # var_posterior / var_prior: 1 belief alone, 0 data alone
+    n_images: int = 0
+    n_observations: int = 0
+
+
+class CamFromRig(Record):
+    """x_cam = rotation x_rig + translation."""
+
+    rotation_wxyz: tuple[float, float, float, float]
+    translation: tuple[float, float, float]  # m when rig.metric, else baselines (rig.scale.source)
+    sigma_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about the camera's x, y, z
+    sigma_translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class Scale(Record):
+    source: str  # what gave the unit of length
+    sigma_relative: float | None = None  # None: no metric scale
+
+
+class RigResult(Record):
+    reference: str
+    cam_from_rig: dict[str, CamFromRig]
+    metric: bool
+    scale: Scale
+
+
+class Covariance(Record):
+    """Joint covariance of everything estimated of the cameras and the rig.
+
+    Names are `camera.parameter`, `camera.rotation_x` (radians about the camera's axes) and
+    `camera.translation_x` (unit of the rig).
+    """
+
+    names: tuple[str, ...] = ()
+    matrix: tuple[tuple[float, ...], ...] = ()
+
+
+class Noise(Record):
+    sigma_px: float  # robust sigma of one pixel coordinate
+    inflation: float = 1.0  # median of stated sigma / model sigma
+
+
+class WeakDirection(Record):
+    what: str
+    effect_px: float | None
+    remedy: str
+
+
+class Verdict(Record):
+    usable: bool
+    weak: tuple[WeakDirection, ...] = ()
+    messages: tuple[str, ...] = ()
+
+
+class Solve(Record):
+    converged: bool
+    reason: str
+    iterations: int
+    rms_px: float
+    n_frames: int
+    n_images: int
+    n_points: int
+    n_observations: int
+    seconds: dict[str, float] = {}
+
+
+class Provenance(Record):
+    version: str
+    versions: dict[str, str] = {}
+    command: str = ""
+    config: dict[str, object] = {}
+    seed: int = 0
+    input_hashes: dict[str, str] = {}
+    pixel_convention: Literal["OpenCV: the centre of the top-left pixel is (0, 0)"] = (
+        "OpenCV: the centre of the top-left pixel is (0, 0)"
+    )
+
+
+class Calibration(Record):
+    """The result of a calibration, or the truth of a simulation."""
+
+    format: Literal["sfm_calib/1"] = FORMAT
+    cameras: dict[str, CameraResult]
+    rig: RigResult
+    covariance: Covariance = Covariance()
+    noise: Noise | None = None
+    verdict: Verdict | None = None
+    solve: Solve | None = None
+    provenance: Provenance = Field(default_factory=lambda: Provenance(version=""))
+
+    def camera(self, name: str) -> Camera:
+        """The camera as the maths sees it."""
+        entry = self.cameras[name]
+        params = np.array([entry.params[p] for p in PARAMETER_NAMES[entry.lens]])
+        return Camera(name, entry.lens, entry.size, params)
+
+    def cam_from_rig(self, name: str) -> Transform:
+        entry = self.rig.cam_from_rig[name]
+        return Transform.from_wxyz(entry.rotation_wxyz, entry.translation)
+
+
+def truth(cameras: list[Camera], cam_from_rig: list[Transform], version: str) -> Calibration:
+    """A calibration known exactly, as a simulation writes it: metric, without sigmas."""
+    return Calibration(
+        cameras={c.name: CameraResult(lens=c.lens, size=c.size, params=c.named()) for c in cameras},
+        rig=RigResult(
+            reference=cameras[0].name,
+            cam_from_rig={
+                c.name: CamFromRig(
+                    rotation_wxyz=tuple(t.rotation_wxyz.tolist()),
+                    translation=tuple(t.translation.tolist()),
+                )
+                for c, t in zip(cameras, cam_from_rig, strict=True)
+            },
+            metric=True,
+            scale=Scale(source="simulation", sigma_relative=0.0),
+        ),
+        provenance=Provenance(version=version),
+    )
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write atomically. Raises CalibrationError when the place cannot be written."""
+    content = calibration.model_dump_json(indent=1)
+    write_atomically(path, content + "\n")
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration.json. Raises CalibrationError naming the first thing wrong with it."""
+    try:
+        return Calibration.model_validate(json.loads(path.read_text()))
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise CalibrationError(f"{path} is no {FORMAT} file: {where}: {first['msg']}") from error
+    except ValueError as error:
+        raise CalibrationError(f"{path} is not JSON: {error}") from error
