@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,11 +14,11 @@ from graphs.lenses import PARAMETER_NAMES, Camera, LensName
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 
-FORMAT = "sfm_calib/1"
+FORMAT: Final = "sfm_calib/1"
 
 
 class Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CameraResult(Record):

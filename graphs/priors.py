@@ -1,0 +1,77 @@
+"""Soft knowledge: weak, visible beliefs about lenses and rigs, stated in the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphs.frames import FloatArray, Transform
+from graphs.lenses import Camera, nominal_params
+
+# Real lenses sit a few per cent of the width off the image centre (corridor webcam: 6 %).
+# A free principal point drifts by 39 px on forward motion; 3 % of the width holds it.
+PRINCIPAL_POINT_SIGMA = 0.03  # of the image width
+FOCAL_SIGMA = 1.0  # of the focal length: no knowledge
+ASPECT_SIGMA = 0.005  # of fy / fx about 1: pixels are square to a fraction of a per cent
+DISTORTION_SIGMA = {"k1": 1.0, "k2": 1.0, "k3": 1.0, "k4": 1.0, "p1": 1e-3, "p2": 1e-3}
+PINNED_SIGMA = 1e-9  # a parameter that is held fixed
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """Independent beliefs in each lens parameter, and one in the aspect ratio fy / fx."""
+
+    mean: FloatArray  # (n_params,)
+    sigma: FloatArray  # (n_params,)
+    aspect_sigma: float = np.inf
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which parameters are not held fixed (n_params,)."""
+        return self.sigma > PINNED_SIGMA
+
+    def information(self) -> FloatArray:
+        """Information matrix (n_params, n_params) at the mean, the aspect term included."""
+        information = np.diag(self.sigma**-2.0)
+        if np.isfinite(self.aspect_sigma):
+            # fy - fx = 0 within aspect_sigma * f
+            information[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / (
+                self.aspect_sigma * self.mean[0]
+            ) ** 2
+        return information
+
+
+@dataclass(frozen=True)
+class RigPrior:
+    """A belief in one cam_from_rig: rotation about the camera's axes, then translation."""
+
+    cam_from_rig: Transform
+    sigma_rotation: float  # rad, each axis
+    sigma_translation: float  # units of the rig, each axis
+
+
+def weak_lens_prior(camera: Camera) -> LensPrior:
+    """What is believed of any lens before its first image, centred on an ideal one."""
+    width, focal = camera.size[0], float(camera.params[:2].mean())
+    mean = nominal_params(camera.lens, camera.size, focal)
+    sigma = np.array(
+        [FOCAL_SIGMA * focal] * 2
+        + [PRINCIPAL_POINT_SIGMA * width] * 2
+        + [DISTORTION_SIGMA[name] for name in camera.names[4:]]
+    )
+    return LensPrior(mean, sigma, ASPECT_SIGMA)
+
+
+def stated_lens_prior(
+    camera: Camera, mean: dict[str, float], sigma: dict[str, float], fixed: tuple[str, ...]
+) -> LensPrior:
+    """The weak prior with the given means and sigmas in place of its own; `fixed` are held."""
+    weak = weak_lens_prior(camera)
+    centre, spread = weak.mean.copy(), weak.sigma.copy()
+    for index, name in enumerate(camera.names):
+        centre[index] = mean.get(name, centre[index])
+        spread[index] = PINNED_SIGMA if name in fixed else sigma.get(name, spread[index])
+    stated_focals = {"fx", "fy"} & (set(mean) | set(fixed))
+    return LensPrior(centre, spread, np.inf if stated_focals else weak.aspect_sigma)

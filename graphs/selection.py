@@ -1,0 +1,77 @@
+"""Which tracks enter the graph: long enough, and seen from places far enough apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+
+from graphs.frames import FloatArray
+from graphs.problem import Estimate, IntArray, Observations, Problem
+
+MIN_TRACK_LENGTH = 3  # two views of a point cannot show that one is wrong
+
+
+def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
+    """Leave out short tracks and points without parallax, and frames that see nothing then.
+
+    Raises ValueError when nothing is left.
+    """
+    seen = problem.observations
+    length = np.bincount(seen.point, minlength=len(problem.initial.points))
+    keep = (length >= MIN_TRACK_LENGTH) & (parallax_deg(problem) >= min_parallax_deg)
+    if not keep.any():
+        raise ValueError(
+            f"none of {len(length)} points is seen {MIN_TRACK_LENGTH} times with "
+            f"{min_parallax_deg:g} deg of parallax: move the camera sideways, closer to things"
+        )
+    return compact(problem, seen.subset(keep[seen.point]))
+
+
+def compact(problem: Problem, observations: Observations) -> Problem:
+    """The problem with these observations, and only the frames and points they see."""
+    start = problem.initial
+    points, point = np.unique(observations.point, return_inverse=True)
+    frames, frame = np.unique(observations.frame, return_inverse=True)
+    return replace(
+        problem,
+        initial=Estimate(
+            start.cameras,
+            start.cam_from_rig,
+            tuple(start.rig_from_world[f] for f in frames),
+            start.points[points],
+        ),
+        observations=replace(observations, point=point, frame=frame),
+        frame_names=tuple(problem.frame_names[f] for f in frames),
+    )
+
+
+def parallax_deg(problem: Problem) -> FloatArray:
+    """Largest angle (n_points,) between any two rays that see each point."""
+    start, seen = problem.initial, problem.observations
+    rig_centres = np.array([t.inverse.translation for t in start.rig_from_world])
+    world_from_rig = np.array([t.rotation.T for t in start.rig_from_world])
+    in_rig = np.array([t.inverse.translation for t in start.cam_from_rig])[seen.camera]
+    centres = rig_centres[seen.frame] + np.einsum("nij,nj->ni", world_from_rig[seen.frame], in_rig)
+    rays = start.points[seen.point] - centres
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+    order = np.argsort(seen.point, kind="stable")
+    ends = np.cumsum(np.bincount(seen.point, minlength=len(start.points)))
+    return np.degrees(2 * np.arcsin(np.clip(_longest_chord(rays[order], ends) / 2, 0, 1)))
+
+
+@njit(cache=True)
+def _longest_chord(rays: FloatArray, ends: IntArray) -> FloatArray:
+    longest = np.zeros(len(ends))
+    begin = 0
+    for point in range(len(ends)):
+        for i in range(begin, ends[point]):
+            for j in range(i + 1, ends[point]):
+                squared = 0.0
+                for axis in range(3):
+                    squared += (rays[i, axis] - rays[j, axis]) ** 2
+                longest[point] = max(longest[point], squared)
+        longest[point] = np.sqrt(longest[point])
+        begin = ends[point]
+    return longest

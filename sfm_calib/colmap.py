@@ -1,0 +1,264 @@
+"""COLMAP through pycolmap: features, matches, mapping. The only module that knows its +0.5.
+
+COLMAP puts (0.5, 0.5) at the centre of the top-left pixel; everything handed out of here has
+integer pixel centres.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from graphs.frames import Transform
+from graphs.lenses import PARAMETER_NAMES, Camera, LensName
+from graphs.problem import Observations
+from graphs.rig_start import FreeModel
+from sfm_calib.errors import CalibrationError
+from sfm_calib.images import Progress, Scan
+from sfm_calib.pairs import Pair
+
+PIXEL_OFFSET = 0.5
+IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
+PAIRS_A_BATCH = 200
+DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
+
+# One focal length while mapping: with two, OPENCV on a corridor ends at fx 777, fy 208 px.
+MAPPING_MODELS: dict[LensName, tuple[str, tuple[str, ...]]] = {
+    "pinhole": ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
+    "simple_radial": ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
+    "radial": ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
+    "radtan": ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
+    "kannala_brandt": ("RADIAL_FISHEYE", ("f", "cx", "cy", "k1", "k2")),
+}
+
+
+def quiet(verbose: bool) -> None:
+    """COLMAP's own log: all of it, or fatal errors alone."""
+    pycolmap.logging.minloglevel = 0 if verbose else 3
+    pycolmap.logging.logtostderr = True
+
+
+def _cancellable(work: Callable[[Any], Any]) -> Any:
+    """Run `work(token)` in a thread, so that Ctrl-C reaches us and then COLMAP."""
+    token, outcome = pycolmap.CancellationToken(), {}
+
+    def run() -> None:
+        try:
+            outcome["value"] = work(token)
+        except BaseException as error:
+            outcome["error"] = error
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(0.1)
+    except KeyboardInterrupt:
+        token.cancel()
+        thread.join(30)
+        raise
+    if "error" in outcome:
+        raise CalibrationError(f"COLMAP failed: {str(outcome['error']).splitlines()[-1]}")
+    return outcome["value"]
+
+
+def colmap_params(camera: Camera) -> tuple[str, list[float]]:
+    """Mapping model and its parameters for a camera."""
+    model, names = MAPPING_MODELS[camera.lens]
+    known = camera.named()
+    values = {"f": float(camera.params[:2].mean())} | known
+    values |= {"cx": known["cx"] + PIXEL_OFFSET, "cy": known["cy"] + PIXEL_OFFSET}
+    return model, [values[name] for name in names]
+
+
+def camera_from_colmap(name: str, lens: LensName, camera: pycolmap.Camera) -> Camera:
+    """A camera with the parameters that mapping found; those it did not have are zero."""
+    found = dict(zip(MAPPING_MODELS[lens][1], camera.params.tolist(), strict=True))
+    found |= {"fx": found["f"], "fy": found["f"]}
+    found |= {"cx": found["cx"] - PIXEL_OFFSET, "cy": found["cy"] - PIXEL_OFFSET}
+    params = np.array([found.get(p, 0.0) for p in PARAMETER_NAMES[lens]])
+    return Camera(name, lens, (camera.width, camera.height), params)
+
+
+def extract_features(
+    scan: Scan,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    database: Path,
+    max_features: int,
+    progress: Progress,
+) -> None:
+    """SIFT features of every image; one COLMAP camera a physical camera.
+
+    `known`: cameras whose parameters are given; the others start from EXIF or a guess.
+    """
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.sift.max_num_features = max_features
+    done = 0
+    for index in range(len(scan.cameras)):
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = MAPPING_MODELS[lenses[index]][0]
+        reader.default_focal_length_factor = DEFAULT_FOCAL
+        if index in known:
+            reader.camera_params = ",".join(map(repr, colmap_params(known[index])[1]))
+        paths = [image.path for image in scan.images if image.camera == index]
+        for begin in range(0, len(paths), IMAGES_A_BATCH):
+            batch = paths[begin : begin + IMAGES_A_BATCH]
+            _cancellable(
+                lambda token, batch=batch, reader=reader: pycolmap.extract_features(
+                    database, scan.root, batch, pycolmap.CameraMode.SINGLE, reader, options,
+                    pycolmap.Device.cpu, token,
+                )
+            )  # fmt: skip
+            if begin == 0:
+                reader.existing_camera_id = _camera_ids(database, batch[:1])[0]
+            progress("extracting features", done := done + len(batch), len(scan.images))
+
+
+def _camera_ids(database: Path, paths: Sequence[str]) -> list[int]:
+    with pycolmap.Database.open(database) as db:
+        images = [db.read_image_with_name(path) for path in paths]
+    return [image.camera_id for image in images]
+
+
+def read_descriptors(database: Path, path: str) -> NDArray[np.uint8]:
+    """SIFT descriptors (n, 128) of one image."""
+    with pycolmap.Database.open(database) as db:
+        return np.asarray(db.read_descriptors(db.read_image_with_name(path).image_id).data)
+
+
+def match_features(
+    scan: Scan, pairs: Sequence[Pair], database: Path, seed: int, progress: Progress
+) -> None:
+    """Match the given pairs and keep what one epipolar geometry explains."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed  # else threads share one stream of random numbers
+    pairing = pycolmap.ImportedPairingOptions()
+    listing = database.with_name("pairs.txt")
+    pairing.match_list_path = listing
+    for begin in range(0, len(pairs), PAIRS_A_BATCH):
+        batch = pairs[begin : begin + PAIRS_A_BATCH]
+        lines = [f"{scan.images[a].path} {scan.images[b].path}\n" for a, b in batch]
+        listing.write_text("".join(lines))
+        _cancellable(
+            lambda token: pycolmap.match_image_pairs(
+                database, options, pairing, verification, pycolmap.Device.cpu, token
+            )
+        )
+        progress("matching", begin + len(batch), len(pairs))
+
+
+def match_counts(scan: Scan, database: Path) -> dict[Pair, int]:
+    """Verified matches of each pair of images."""
+    number = {image.path: index for index, image in enumerate(scan.images)}
+    with pycolmap.Database.open(database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+        pair_ids, counts = db.read_two_view_geometry_num_inliers()
+    counted: dict[Pair, int] = {}
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        ids = pair_id if isinstance(pair_id, tuple) else pycolmap.pair_id_to_image_pair(pair_id)
+        a, b = sorted(number[names[image_id]] for image_id in ids)
+        counted[a, b] = int(count)
+    return counted
+
+
+@dataclass(frozen=True)
+class MappingAttempt:
+    """How one run of the incremental mapper is started."""
+
+    seed: int
+    min_start_angle_deg: float
+    max_start_forward: float
+
+
+def attempts(seed: int) -> list[MappingAttempt]:
+    """COLMAP's own start first, then gentler ones: 2 of 82 images was seen with an unlucky one."""
+    return [
+        MappingAttempt(seed, 16.0, 0.95),
+        MappingAttempt(seed + 1, 8.0, 0.99),
+        MappingAttempt(seed + 2, 4.0, 1.0),
+    ]
+
+
+def map_images(
+    scan: Scan, database: Path, out: Path, attempt: MappingAttempt, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    """Incremental mapping without rig constraints: models, the one with most images first."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.random_seed = attempt.seed
+    options.mapper.random_seed = attempt.seed
+    options.triangulation.random_seed = attempt.seed
+    options.mapper.init_min_tri_angle = attempt.min_start_angle_deg
+    options.mapper.init_max_forward_motion = attempt.max_start_forward
+    pycolmap.set_random_seed(attempt.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    registered = 0
+
+    def count() -> None:
+        nonlocal registered
+        registered = min(registered + 1, len(scan.images))
+        progress("mapping", registered, len(scan.images))
+
+    models = _cancellable(
+        lambda token: pycolmap.incremental_mapping(
+            database, scan.root, out, options,
+            initial_image_pair_callback=count, next_image_callback=count, cancellation_token=token,
+        )
+    )  # fmt: skip
+    return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def free_model(
+    reconstruction: pycolmap.Reconstruction, scan: Scan, lenses: Sequence[LensName]
+) -> FreeModel:
+    """A reconstruction as arrays: poses by (camera, frame), points, observations."""
+    place = {image.path: image for image in scan.images}
+    images = {i: reconstruction.images[i] for i in sorted(reconstruction.reg_image_ids())}
+    cameras: dict[int, Camera] = {}
+    poses = {}
+    for image in images.values():
+        here = place[image.name]
+        pose = image.cam_from_world()
+        poses[here.camera, here.frame] = Transform(pose.rotation.matrix(), np.ravel(pose.translation))
+        cameras.setdefault(
+            here.camera,
+            camera_from_colmap(scan.cameras[here.camera], lenses[here.camera], image.camera),
+        )
+    keypoints = {i: np.array([p.xy for p in image.points2D]) for i, image in images.items()}
+    pixels, frames, owners, points, positions = [], [], [], [], []
+    for number, point_id in enumerate(sorted(reconstruction.points3D)):
+        point = reconstruction.points3D[point_id]
+        positions.append(np.ravel(point.xyz))
+        elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
+        for image_id, keypoint in elements:
+            here = place[images[image_id].name]
+            pixels.append(keypoints[image_id][keypoint] - PIXEL_OFFSET)
+            frames.append(here.frame)
+            owners.append(here.camera)
+            points.append(number)
+    observations = Observations(
+        np.array(pixels), np.array(frames), np.array(owners), np.array(points)
+    )
+    every = tuple(
+        cameras.get(i) or _unseen_camera(scan, lenses, i) for i in range(len(scan.cameras))
+    )
+    return FreeModel(every, poses, np.array(positions), observations)
+
+
+def _unseen_camera(scan: Scan, lenses: Sequence[LensName], index: int) -> Camera:
+    width, height = scan.sizes[index]
+    guess = pycolmap.Camera.create_from_model_name(
+        1, MAPPING_MODELS[lenses[index]][0], DEFAULT_FOCAL * max(width, height), width, height
+    )
+    return camera_from_colmap(scan.cameras[index], lenses[index], guess)

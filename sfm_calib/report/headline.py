@@ -1,0 +1,102 @@
+"""The first screen: may I use this, what did it rest on, and how much was it in doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from graphs.problem import Problem
+from sfm_calib.report.rows import Z_ALARM, TruthRow
+from sfm_calib.result import Calibration
+
+Tone = Literal["good", "doubtful", "bad", "unknown"]
+
+
+@dataclass(frozen=True)
+class Banner:
+    """The verdict in one line and the reasons below it."""
+
+    tone: Tone
+    text: str
+    explanation: str
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One key figure: the number, what it counts, and a remark in small print."""
+
+    value: str
+    label: str
+    remark: str = ""
+
+
+def banner(calibration: Calibration) -> Banner:
+    """What a reader in a hurry must know."""
+    verdict, solve = calibration.verdict, calibration.solve
+    if verdict is None:
+        return Banner("unknown", "Not judged", "This file holds no verdict.")
+    if not verdict.usable:
+        return Banner("bad", "Not usable", "Do not deploy this calibration; the reasons follow.")
+    if solve is not None and not solve.converged:
+        stopped = f"The solver stopped before it converged: {solve.reason}."
+        return Banner("doubtful", "Usable with care", stopped)
+    if verdict.weak:
+        count = len(verdict.weak)
+        what = "one direction" if count == 1 else f"{count} directions"
+        return Banner("doubtful", "Usable with care", f"The scan left {what} weakly determined.")
+    return Banner("good", "Usable", "The scan determined every parameter that was estimated.")
+
+
+def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...]:
+    """The numbers under the verdict."""
+    solve, noise = calibration.solve, calibration.noise
+    observations = problem.observations
+    seen = np.unique(np.column_stack([observations.frame, observations.camera]), axis=0)
+    n_images = solve.n_images if solve else len(seen)
+    n_frames = solve.n_frames if solve else len(problem.frame_names)
+    n_observations = solve.n_observations if solve else len(observations)
+    n_points = solve.n_points if solve else len(np.unique(observations.point))
+    n_cameras = len(calibration.cameras)
+    cameras = "one camera" if n_cameras == 1 else f"{n_cameras} cameras"
+    figures = [
+        Figure(f"{n_images:,}", "images used", f"{n_frames:,} frames, {cameras}"),
+        Figure(f"{n_observations:,}", "observations", f"of {n_points:,} scene points"),
+    ]
+    if noise is not None:
+        figures.append(Figure(f"{noise.sigma_px:.3f} px", "noise sigma", "robust, one coordinate"))
+    if solve is not None:
+        figures.append(Figure(f"{solve.rms_px:.3f} px", "RMS residual", "mismatches included"))
+    if noise is not None:
+        figures.append(
+            Figure(f"× {noise.inflation:.2f}", "inflation", "stated sigma / model sigma")
+        )
+    return (*figures, _scale_figure(calibration))
+
+
+def _scale_figure(calibration: Calibration) -> Figure:
+    scale = calibration.rig.scale
+    if not calibration.rig.metric:
+        return Figure("not metric", "scale", f"unit: {scale.source}")
+    remark = f"from {scale.source}"
+    if scale.sigma_relative:
+        remark += f", ± {100 * scale.sigma_relative:.2g} %"
+    return Figure("metric", "scale", remark)
+
+
+def truth_summary(truth_rows: Sequence[TruthRow]) -> str:
+    """How the errors compare with the stated sigmas, in one sentence."""
+    judged = [row for row in truth_rows if np.isfinite(row.z)]
+    if not judged:
+        return "No quantity carries a sigma to judge its error by."
+    size = np.abs([row.z for row in judged])
+    worst = judged[int(np.argmax(size))]
+    alarms = int((size > Z_ALARM).sum())
+    beyond = "none" if alarms == 0 else str(alarms)
+    return (
+        f"Of {len(judged)} quantities, {100 * np.mean(size <= 1):.0f} % lie within 1 sigma of the "
+        f"truth (68 % expected), {100 * np.mean(size <= 2):.0f} % within 2 (95 %) and {beyond} "
+        f"beyond {Z_ALARM:.0f}. The largest is {worst.name} with z = {worst.z:+.1f}."
+    )

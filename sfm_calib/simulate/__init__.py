@@ -1,0 +1,1 @@
+"""Simulated scans with known truth: of images (a rendered room) and of feature tracks."""
