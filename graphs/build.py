@@ -15,6 +15,7 @@ from graphs.keys import frame_key, lens_key, point_key, rig_key
 from graphs.priors import LensPrior, RigPrior, weak_lens_prior
 from graphs.problem import Problem
 
+NO_KNOWLEDGE = 1e6  # in place of an infinite sigma, which GTSAM does not take
 LossName = Literal["cauchy", "huber", "none"]
 
 
@@ -62,14 +63,18 @@ def observation_noise(options: GraphOptions) -> gtsam.noiseModel.Base:
     noise = gtsam.noiseModel.Isotropic.Sigma(2, options.sigma_px)
     if options.loss == "none":
         return noise
-    estimators = {"cauchy": gtsam.noiseModel.mEstimator.Cauchy, "huber": gtsam.noiseModel.mEstimator.Huber}
-    return gtsam.noiseModel.Robust.Create(estimators[options.loss].Create(options.loss_scale), noise)
+    estimators = {
+        "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+        "huber": gtsam.noiseModel.mEstimator.Huber,
+    }
+    return gtsam.noiseModel.Robust.Create(
+        estimators[options.loss].Create(options.loss_scale), noise
+    )
 
 
 def _rig_prior_factor(camera: int, prior: RigPrior) -> gtsam.NonlinearFactor:
-    # An isotropic belief is the same in the camera's axes as in the rig's, up to lever arms
-    # that a weak prior does not notice.
     sigmas = np.array([prior.sigma_rotation] * 3 + [prior.sigma_translation] * 3)
+    sigmas = np.minimum(sigmas, NO_KNOWLEDGE)
     pose = to_gtsam_inverse(prior.cam_from_rig)
     return gtsam.PriorFactorPose3(rig_key(camera), pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 

@@ -38,7 +38,13 @@ class Covariance:
 
     @property
     def sigma(self) -> dict[str, float]:
-        return dict(zip(self.names, np.sqrt(np.diag(self.matrix)).tolist(), strict=True))
+        variances = np.maximum(np.diag(self.matrix), 0.0)  # an exact zero may round below
+        return dict(zip(self.names, np.sqrt(variances).tolist(), strict=True))
+
+    def of_difference(self, a: str, b: str) -> float:
+        """Sigma of parameter `a` minus parameter `b`; one that is not here has none."""
+        weights = np.array([(name == a) - (name == b) for name in self.names], dtype=np.float64)
+        return float(np.sqrt(max(weights @ self.matrix @ weights, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,9 @@ def linearised_system(graph: CalibrationGraph, values: gtsam.Values) -> Linearis
     linear = graph.factors.linearize(values)
     rows, columns, entries = linear.sparseJacobian_()
     shape = (int(rows.max()), int(columns.max()))
-    whole = scipy.sparse.csr_array((entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape)
+    whole = scipy.sparse.csr_array(
+        (entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape
+    )
     start = graph.problem.initial
     sizes = {lens_key(i): NATIVE_SIZE for i in range(len(start.cameras))}
     sizes |= {rig_key(i): 6 for i in range(len(start.cameras))}
@@ -190,7 +198,9 @@ def _calibration_columns(
         free = graph.lens_priors[index].free
         slots = [slot for slot, is_free in zip(native_slots(camera), free, strict=True) if is_free]
         columns += [start + slot for slot in slots]
-        names += [f"{camera.name}.{p}" for p, is_free in zip(camera.names, free, strict=True) if is_free]
+        names += [
+            f"{camera.name}.{p}" for p, is_free in zip(camera.names, free, strict=True) if is_free
+        ]
         blocks.append(np.eye(len(slots)))
     for index, camera in enumerate(estimate.cameras):
         if index == graph.problem.reference:

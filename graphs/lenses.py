@@ -111,7 +111,10 @@ def valid_limit(camera: Camera) -> float:
     First positive zero of d r_distorted / d r, a polynomial in r^2; infinity when there is none.
     """
     if camera.lens == "kannala_brandt":
-        coefficients = [1.0, *(c * k for c, k in zip((3, 5, 7, 9), camera.params[4:8], strict=True))]
+        coefficients = [
+            1.0,
+            *(c * k for c, k in zip((3, 5, 7, 9), camera.params[4:8], strict=True)),
+        ]
         cap = np.pi  # an angle off the axis is at most half a turn
     else:
         k1, k2 = _radial(camera)

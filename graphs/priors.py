@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,41 +38,51 @@ class LensPrior:
         information = np.diag(self.sigma**-2.0)
         if np.isfinite(self.aspect_sigma):
             # fy - fx = 0 within aspect_sigma * f
-            information[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / (
-                self.aspect_sigma * self.mean[0]
-            ) ** 2
+            information[:2, :2] += (
+                np.array([[1.0, -1.0], [-1.0, 1.0]]) / (self.aspect_sigma * self.mean[0]) ** 2
+            )
         return information
 
 
 @dataclass(frozen=True)
 class RigPrior:
-    """A belief in one cam_from_rig: rotation about the camera's axes, then translation."""
+    """A belief in where a camera sits: its turn about its own axes, and its centre in the rig."""
 
     cam_from_rig: Transform
     sigma_rotation: float  # rad, each axis
-    sigma_translation: float  # units of the rig, each axis
+    sigma_translation: float  # of the centre, units of the rig, each axis
 
 
-def weak_lens_prior(camera: Camera) -> LensPrior:
+def weak_lens_prior(
+    camera: Camera,
+    principal_point_sigma: float = PRINCIPAL_POINT_SIGMA,
+    aspect_sigma: float = ASPECT_SIGMA,
+) -> LensPrior:
     """What is believed of any lens before its first image, centred on an ideal one."""
     width, focal = camera.size[0], float(camera.params[:2].mean())
     mean = nominal_params(camera.lens, camera.size, focal)
     sigma = np.array(
         [FOCAL_SIGMA * focal] * 2
-        + [PRINCIPAL_POINT_SIGMA * width] * 2
+        + [principal_point_sigma * width] * 2
         + [DISTORTION_SIGMA[name] for name in camera.names[4:]]
     )
-    return LensPrior(mean, sigma, ASPECT_SIGMA)
+    return LensPrior(mean, sigma, aspect_sigma)
 
 
 def stated_lens_prior(
-    camera: Camera, mean: dict[str, float], sigma: dict[str, float], fixed: tuple[str, ...]
+    camera: Camera,
+    weak: LensPrior,
+    mean: dict[str, float],
+    sigma: dict[str, float],
+    fixed: Sequence[str],
 ) -> LensPrior:
-    """The weak prior with the given means and sigmas in place of its own; `fixed` are held."""
-    weak = weak_lens_prior(camera)
+    """`weak` with the given means and sigmas in place of its own; `fixed` are held.
+
+    A stated or held focal length replaces the belief in square pixels.
+    """
     centre, spread = weak.mean.copy(), weak.sigma.copy()
     for index, name in enumerate(camera.names):
         centre[index] = mean.get(name, centre[index])
         spread[index] = PINNED_SIGMA if name in fixed else sigma.get(name, spread[index])
-    stated_focals = {"fx", "fy"} & (set(mean) | set(fixed))
-    return LensPrior(centre, spread, np.inf if stated_focals else weak.aspect_sigma)
+    stated = {"fx", "fy"} & (set(mean) | set(fixed))
+    return LensPrior(centre, spread, np.inf if stated else weak.aspect_sigma)

@@ -45,7 +45,12 @@ def link_cameras(model: FreeModel, reference: int) -> tuple[tuple[Transform, ...
     frames = [set(model.images_of(camera)) for camera in range(n)]
     while len(linked) < n:
         count, known, new = max(
-            ((len(frames[a] & frames[b]), a, b) for a in linked for b in range(n) if b not in linked),
+            (
+                (len(frames[a] & frames[b]), a, b)
+                for a in linked
+                for b in range(n)
+                if b not in linked
+            ),
             key=lambda link: (link[0], -link[1], -link[2]),
         )
         if count < MIN_SHARED_FRAMES:
@@ -66,7 +71,10 @@ def median_transform(transforms: list[Transform]) -> Transform:
 
 
 def impose_rig(
-    model: FreeModel, cam_from_rig: tuple[Transform, ...], frame_names: tuple[str, ...], reference: int
+    model: FreeModel,
+    cam_from_rig: tuple[Transform, ...],
+    frame_names: tuple[str, ...],
+    reference: int,
 ) -> tuple[Problem, list[tuple[int, int]]]:
     """A Problem with one pose a frame, and the images (camera, frame) that contradict it.
 
@@ -79,7 +87,7 @@ def impose_rig(
         proposals.setdefault(frame, []).append(rig_from_world)
     seen_frames = sorted(proposals)
     seen = model.observations
-    best = np.full((len(seen_frames), 1), -1.0)
+    best = np.full(len(seen_frames), -1.0)
     chosen: list[Transform] = [proposals[frame][0] for frame in seen_frames]
     compact = np.full(len(frame_names), -1)
     compact[seen_frames] = np.arange(len(seen_frames))
@@ -88,8 +96,8 @@ def impose_rig(
         trial = tuple(proposals[f][min(rank, len(proposals[f]) - 1)] for f in seen_frames)
         agrees = agreeing(Estimate(model.cameras, cam_from_rig, trial, model.points), seen)
         score = np.bincount(seen.frame, weights=agrees, minlength=len(seen_frames))
-        for place in np.flatnonzero(score > best[:, 0]):
-            chosen[place], best[place, 0] = trial[place], score[place]
+        for place in np.flatnonzero(score > best):
+            chosen[place], best[place] = trial[place], score[place]
     start = Estimate(model.cameras, cam_from_rig, tuple(chosen), model.points)
     names = tuple(frame_names[frame] for frame in seen_frames)
     dropped, keep = _contradicting_images(start, seen)

@@ -6,6 +6,7 @@ integer pixel centres.
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,18 +25,29 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan
 from sfm_calib.pairs import Pair
 
+VERSION = pycolmap.__version__
 PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
+# COLMAP's names of its parameters, where they are not ours.
+PARAMETER_ALIASES = {"k": "k1"}
 # One focal length while mapping: with two, OPENCV on a corridor ends at fx 777, fy 208 px.
-MAPPING_MODELS: dict[LensName, tuple[str, tuple[str, ...]]] = {
-    "pinhole": ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
-    "simple_radial": ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
-    "radial": ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
-    "radtan": ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
-    "kannala_brandt": ("RADIAL_FISHEYE", ("f", "cx", "cy", "k1", "k2")),
+MAPPING_MODEL: dict[LensName, str] = {
+    "pinhole": "SIMPLE_PINHOLE",
+    "simple_radial": "SIMPLE_RADIAL",
+    "radial": "RADIAL",
+    "radtan": "RADIAL",
+    "kannala_brandt": "RADIAL_FISHEYE",
+}
+# The model that holds every parameter of the lens, for triangulating with a refined one.
+EXACT_MODEL: dict[LensName, str] = {
+    "pinhole": "PINHOLE",
+    "simple_radial": "OPENCV",
+    "radial": "OPENCV",
+    "radtan": "OPENCV",
+    "kannala_brandt": "OPENCV_FISHEYE",
 }
 
 
@@ -69,19 +81,28 @@ def _cancellable(work: Callable[[Any], Any]) -> Any:
     return outcome["value"]
 
 
-def colmap_params(camera: Camera) -> tuple[str, list[float]]:
-    """Mapping model and its parameters for a camera."""
-    model, names = MAPPING_MODELS[camera.lens]
-    known = camera.named()
-    values = {"f": float(camera.params[:2].mean())} | known
-    values |= {"cx": known["cx"] + PIXEL_OFFSET, "cy": known["cy"] + PIXEL_OFFSET}
-    return model, [values[name] for name in names]
+def colmap_camera(camera: Camera, model: str, camera_id: int = 1) -> pycolmap.Camera:
+    """A camera in one of COLMAP's models; parameters the model has not are left out."""
+    width, height = camera.size
+    result = pycolmap.Camera.create_from_model_name(camera_id, model, 1.0, width, height)
+    ours = camera.named()
+    ours |= {"f": float(camera.params[:2].mean())}
+    ours |= {"cx": ours["cx"] + PIXEL_OFFSET, "cy": ours["cy"] + PIXEL_OFFSET}
+    result.params = [ours.get(name, 0.0) for name in parameter_names(result)]
+    return result
+
+
+def parameter_names(camera: pycolmap.Camera) -> list[str]:
+    """Our names of a COLMAP camera's parameters, in its order."""
+    names = (name.strip() for name in camera.params_info.split(","))
+    return [PARAMETER_ALIASES.get(name, name) for name in names]
 
 
 def camera_from_colmap(name: str, lens: LensName, camera: pycolmap.Camera) -> Camera:
-    """A camera with the parameters that mapping found; those it did not have are zero."""
-    found = dict(zip(MAPPING_MODELS[lens][1], camera.params.tolist(), strict=True))
-    found |= {"fx": found["f"], "fy": found["f"]}
+    """A camera with the parameters that COLMAP found; those its model has not are zero."""
+    found = dict(zip(parameter_names(camera), camera.params.tolist(), strict=True))
+    if "f" in found:
+        found |= {"fx": found["f"], "fy": found["f"]}
     found |= {"cx": found["cx"] - PIXEL_OFFSET, "cy": found["cy"] - PIXEL_OFFSET}
     params = np.array([found.get(p, 0.0) for p in PARAMETER_NAMES[lens]])
     return Camera(name, lens, (camera.width, camera.height), params)
@@ -105,10 +126,12 @@ def extract_features(
     done = 0
     for index in range(len(scan.cameras)):
         reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = MAPPING_MODELS[lenses[index]][0]
+        reader.camera_model = MAPPING_MODEL[lenses[index]]
         reader.default_focal_length_factor = DEFAULT_FOCAL
         if index in known:
-            reader.camera_params = ",".join(map(repr, colmap_params(known[index])[1]))
+            reader.camera_params = ",".join(
+                map(repr, colmap_camera(known[index], reader.camera_model).params.tolist())
+            )
         paths = [image.path for image in scan.images if image.camera == index]
         for begin in range(0, len(paths), IMAGES_A_BATCH):
             batch = paths[begin : begin + IMAGES_A_BATCH]
@@ -172,6 +195,34 @@ def match_counts(scan: Scan, database: Path) -> dict[Pair, int]:
     return counted
 
 
+def worth(models: Sequence[pycolmap.Reconstruction], scan: Scan) -> tuple[int, int, int]:
+    """What a mapping explains: cameras placed in any model, images and points of the largest.
+
+    Cameras first: models of different cameras can be joined through the rig's motion.
+    """
+    if not models:
+        return 0, 0, 0
+    owner = {image.path: image.camera for image in scan.images}
+    names = {m.images[i].name for m in models for i in m.reg_image_ids()}
+    cameras = {owner[name] for name in names}
+    return len(cameras), models[0].num_reg_images(), models[0].num_points3D()
+
+
+def write_models(models: Sequence[pycolmap.Reconstruction], place: Path) -> None:
+    """Keep these models alone in `place`, the largest as 0."""
+    shutil.rmtree(place, ignore_errors=True)
+    for number, model in enumerate(models):
+        folder = place / str(number)
+        folder.mkdir(parents=True)
+        model.write(folder)
+
+
+def read_models(place: Path) -> list[pycolmap.Reconstruction]:
+    """The models that `write_models` kept, in its order."""
+    folders = sorted((place / "best").iterdir(), key=lambda folder: int(folder.name))
+    return [pycolmap.Reconstruction(folder) for folder in folders]
+
+
 @dataclass(frozen=True)
 class MappingAttempt:
     """How one run of the incremental mapper is started."""
@@ -230,7 +281,9 @@ def free_model(
     for image in images.values():
         here = place[image.name]
         pose = image.cam_from_world()
-        poses[here.camera, here.frame] = Transform(pose.rotation.matrix(), np.ravel(pose.translation))
+        poses[here.camera, here.frame] = Transform(
+            pose.rotation.matrix(), np.ravel(pose.translation)
+        )
         cameras.setdefault(
             here.camera,
             camera_from_colmap(scan.cameras[here.camera], lenses[here.camera], image.camera),
@@ -259,6 +312,6 @@ def free_model(
 def _unseen_camera(scan: Scan, lenses: Sequence[LensName], index: int) -> Camera:
     width, height = scan.sizes[index]
     guess = pycolmap.Camera.create_from_model_name(
-        1, MAPPING_MODELS[lenses[index]][0], DEFAULT_FOCAL * max(width, height), width, height
+        1, MAPPING_MODEL[lenses[index]], DEFAULT_FOCAL * max(width, height), width, height
     )
     return camera_from_colmap(scan.cameras[index], lenses[index], guess)

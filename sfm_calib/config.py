@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -21,8 +21,8 @@ class Options(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    lens: LensName = "radial"
-    """Lens model of every camera that rig.yaml does not give one."""
+    lens: LensName | Literal["auto"] = "auto"
+    """Lens of every camera that rig.yaml gives none; auto: radtan for a rig, radial for one."""
     reference: str | None = None
     """Camera whose frame is the rig's frame; default: the first by name."""
     frames: Literal["stem", "order"] = "stem"
@@ -118,14 +118,14 @@ def load_rig_config(path: Path) -> RigConfig:
     try:
         return RigConfig.model_validate(content)
     except ValidationError as error:
-        raise CalibrationError(f"{path}: {first_problem(error, content)}") from error
+        raise CalibrationError(f"{path}: {first_problem(error)}") from error
 
 
 def error_text(error: yaml.YAMLError) -> str:
     return str(getattr(error, "problem", None) or error).splitlines()[0]
 
 
-def first_problem(error: ValidationError, content: dict[str, Any]) -> str:
+def first_problem(error: ValidationError) -> str:
     """The first validation error as one line, with the nearest valid name for an unknown key."""
     problem = error.errors()[0]
     where = ".".join(str(part) for part in problem["loc"])

@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 
 from sfm_calib import video
+from sfm_calib.cache import Cache
 from sfm_calib.errors import CalibrationError
+from sfm_calib.files import sha256
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 MIN_IMAGES = 3  # fewer views do not determine a focal length
@@ -50,12 +52,12 @@ class Scan:
 
 def read_scan(
     scan: Path,
-    cache: Path,
+    cache: Cache,
     matching: Literal["stem", "order"],
     video_frames: int,
     progress: Progress,
 ) -> Scan:
-    """Find and check the images of a scan; videos are unpacked into `cache`.
+    """Find and check the images of a scan; videos are unpacked into the cache.
 
     Raises CalibrationError when there is nothing to calibrate from, or sizes differ.
     """
@@ -70,7 +72,10 @@ def read_scan(
                 f"{scan} holds no images: expected one sub-folder of images per camera, images "
                 f"directly in it, or videos ({' '.join(sorted(IMAGE_SUFFIXES | video.SUFFIXES))})"
             )
-        root = video.unpack(videos, cache / "frames", video_frames, progress)
+        inputs = [{name: sha256(path) for name, path in videos.items()}, video_frames]
+        root = cache.stage(
+            "frames", inputs, lambda place: video.unpack(videos, place, video_frames, progress)
+        )
         files = find_images(root)
     readable, warnings, sizes = _check_files(root, files, progress)
     n_images = sum(len(paths) for paths in readable.values())

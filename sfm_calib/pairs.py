@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from sfm_calib.images import Scan
 
-MAX_ALL_PAIRS = 3000  # about a minute and a half on two cores at 8192 features
-NEAR_FRAMES = 6  # neighbours in time, each way and of every camera
+MAX_COMPARISONS = 2e10  # of descriptors: about a minute on two cores
+# Neighbours in time, of every camera; the wide steps are what fixes the focal length of a
+# forward drive.
+FRAME_STEPS = (0, 1, 2, 3, 4, 5, 6, 8, 12, 16, 24)
 SIMILAR_IMAGES = 15  # neighbours in appearance: loops, unordered photographs
 VOCABULARY_SIZE = 64
 DESCRIPTORS_A_IMAGE = 300  # sampled for the vocabulary
@@ -27,20 +29,21 @@ def choose_pairs(
 ) -> list[Pair]:
     """Sorted pairs of image indices. `descriptors(i)` reads the features (n, 128) of image i."""
     n = len(scan.images)
-    everything = n * (n - 1) // 2
-    if how == "all" or (how == "auto" and everything <= MAX_ALL_PAIRS):
+    counts = np.array([len(descriptors(i)) for i in range(n)], dtype=np.float64)
+    comparisons = (counts.sum() ** 2 - (counts**2).sum()) / 2
+    if how == "all" or (how == "auto" and comparisons <= MAX_COMPARISONS):
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
     return sorted(near_in_time(scan) | similar(n, descriptors, seed))
 
 
 def near_in_time(scan: Scan) -> set[Pair]:
-    """Pairs of images at most NEAR_FRAMES frames apart, of the same camera or another."""
+    """Pairs of images FRAME_STEPS frames apart, of the same camera or another."""
     by_frame: dict[int, list[int]] = {}
     for number, image in enumerate(scan.images):
         by_frame.setdefault(image.frame, []).append(number)
     pairs = set()
     for frame, members in by_frame.items():
-        for step in range(NEAR_FRAMES + 1):
+        for step in FRAME_STEPS:
             for a in members:
                 pairs |= {(min(a, b), max(a, b)) for b in by_frame.get(frame + step, []) if a != b}
     return pairs

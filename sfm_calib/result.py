@@ -91,6 +91,7 @@ class Solve(Record):
     n_images: int
     n_points: int
     n_observations: int
+    n_rejected: int = 0  # mismatches, beyond the loss
     seconds: dict[str, float] = {}
 
 

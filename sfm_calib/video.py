@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,8 +30,8 @@ def unpack(
     out: Path,
     max_frames: int,
     progress: Callable[[str, int, int], None],
-) -> Path:
-    """Write the picked frames as OUT/<camera>/<frame number>.png and return OUT.
+) -> None:
+    """Write the picked frames as OUT/<camera>/<frame number>.png, or OUT/... of a lone video.
 
     Videos of one folder are taken as started together: the same frame numbers of each are used.
     Raises CalibrationError when a video cannot be decoded.
@@ -42,12 +41,10 @@ def unpack(
     motion = np.max([motion[:length] for motion, _ in tracks.values()], axis=0)
     sharpness = np.min([_ranks(sharp[:length]) for _, sharp in tracks.values()], axis=0)
     picked = pick_frames(motion, sharpness, max_frames)
-    shutil.rmtree(out, ignore_errors=True)
     for name, path in videos.items():
         folder = out / name if len(videos) > 1 else out
         folder.mkdir(parents=True, exist_ok=True)
         _write_frames(path, set(picked), folder, progress)
-    return out
 
 
 def pick_frames(

@@ -1,11 +1,10 @@
-"""Simulated scans and tracks: reproducible, geometrically exact, whole or absent."""
+"""Simulated scans: reproducible, geometrically exact, whole or absent."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import get_args
 
@@ -14,9 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from graphs.frames import FloatArray, Transform, angle_between
+from graphs.frames import FloatArray, Transform
 from graphs.lenses import Camera, LensName, project, unproject
-from graphs.problem import residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import load_calibration
 from sfm_calib.simulate import render as rendering
@@ -25,13 +23,6 @@ from sfm_calib.simulate.rigs import CAMERA_COUNT, TrajectoryName, make_rig, make
 from sfm_calib.simulate.room import Room, build_room, import_open3d
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.textures import pink_noise
-from sfm_calib.simulate.tracks import (
-    MIN_OBSERVATIONS_A_FRAME,
-    TrackOptions,
-    read_tracks,
-    simulate_tracks,
-    write_tracks,
-)
 
 try:
     import_open3d()
@@ -42,7 +33,6 @@ except CalibrationError as missing:
 needs_open3d = pytest.mark.skipif(bool(OPEN3D_MISSING), reason=OPEN3D_MISSING)
 
 SMALL = SimulateOptions(rig="stereo", frames=2, size=(96, 72), supersampling=2)
-TRACKS = TrackOptions(rig="stereo", frames=20, points=1500)
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -68,9 +58,6 @@ def small_scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scan") / "out"
     simulate_scan(SMALL, out, silent)
     return out
-
-
-# ---- images --------------------------------------------------------------------------------
 
 
 @needs_open3d
@@ -149,9 +136,10 @@ def test_charuco_corners_are_where_the_lens_projects_them(
         board.marker_m,
         cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
     )
-    errors = []
+    errors, options = [], RenderOptions(supersampling=2)
+    table = ray_table(make_rig("mono", lens).cameras[0], 2)
     for camera, cam_from_world in views_of_board(lens):
-        image = render(camera, cam_from_world, charuco_room, rng(), RenderOptions(supersampling=2))
+        image = render(camera, cam_from_world, charuco_room, rng(), options, table)
         corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(image)
         truth = project(camera, cam_from_world @ (board.world_from_board @ board.corners_m))
         errors.append(corners.reshape(-1, 2) - truth[ids.ravel()])
@@ -186,7 +174,7 @@ def assert_no_bias(errors_px: FloatArray, at_least: int) -> None:
 def test_continued_rays_see_what_cast_rays_see(
     charuco_room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    camera = make_rig("mono", size=(160, 120)).cameras[0]
+    camera = make_rig("mono", size=(320, 240)).cameras[0]
     table, options = ray_table(camera), RenderOptions(noise=0)
     for cam_from_world in make_trajectory("handheld", 40, rng())[::13]:
         quick = render(camera, cam_from_world, charuco_room, rng(), options, table)
@@ -207,7 +195,7 @@ def test_supersampling_removes_aliases(charuco_room: Room) -> None:
         options = RenderOptions(supersampling=supersampling, noise=0)
         return render(camera, cam_from_world, charuco_room, rng(), options).astype(float)
 
-    best = image(8)
+    best = image(6)
     assert np.sqrt(np.square(image(3) - best).mean()) < 0.6  # the sensor's noise is 2
     assert np.sqrt(np.square(image(1) - best).mean()) > 0.6
 
@@ -251,14 +239,16 @@ def test_cameras_stay_half_a_metre_clear(charuco_room: Room, name: TrajectoryNam
             assert charuco_room.distance_m(np.array(centres)).min() > 0.5
 
 
-def test_handheld_scan_tilts_and_keeps_its_overlap() -> None:
-    placed = make_trajectory("handheld", 40, rng(3))
-    steps_deg = [np.rad2deg(angle_between(a.rotation, b.rotation)) for a, b in pairwise(placed)]
-    assert max(steps_deg) < 17  # of a field of view of 61 x 48 degrees
+@pytest.mark.parametrize("seed", range(5))
+def test_handheld_scan_tilts_and_keeps_its_overlap(seed: int) -> None:
+    placed = make_trajectory("handheld", 40, rng(seed))
+    forward = np.array([t.rotation[2] for t in placed])  # the rig's z in the world
+    turns_deg = np.rad2deg(np.arccos((forward[1:] * forward[:-1]).sum(1)))
+    assert turns_deg.max() < 22  # of a field of view of 61 x 48 degrees
     up = np.array([t.rotation[:, 2] for t in placed])  # the world's z in the rig
     roll_deg = np.rad2deg(np.arctan2(up[:, 0], -up[:, 1]))
-    assert roll_deg.max() > 25
-    assert roll_deg.min() < -25
+    assert 30 < np.abs(roll_deg).max() < 47
+    assert np.ptp(roll_deg) > 50
 
 
 def test_noise_texture_is_the_same_nowhere() -> None:
@@ -334,121 +324,3 @@ def test_missing_open3d_is_one_line_with_the_remedy(
         simulate_scan(SMALL, tmp_path / "out", silent)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
-
-
-# ---- tracks --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lens", ["pinhole", "radial", "radtan", "kannala_brandt"])
-def test_true_residuals_have_the_stated_sigma(lens: LensName) -> None:
-    options = TRACKS.model_copy(update={"lens": lens, "sigma_px": 0.7})
-    problem, true = simulate_tracks(options, rng())
-    residuals = residuals_px(true, problem.observations)
-    assert np.isfinite(residuals).all()
-    assert residuals.std() == pytest.approx(0.7, rel=0.03)
-    assert np.abs(residuals.mean(0)).max() < 0.05
-
-
-@pytest.mark.parametrize("kind", ["uniform", "heavy"])
-def test_outliers_have_the_share_asked_for(kind: str) -> None:
-    options = TRACKS.model_copy(
-        update={"outlier_share": 0.2, "outlier_kind": kind, "sigma_px": 1e-6}
-    )
-    problem, true = simulate_tracks(options, rng())
-    wrong = np.linalg.norm(residuals_px(true, problem.observations), axis=1) > 1e-3
-    assert wrong.mean() == pytest.approx(0.2, abs=1e-3)
-
-
-def test_the_initial_estimate_is_off_as_stated() -> None:
-    problem, true = simulate_tracks(TRACKS, rng())
-    for start, camera in zip(problem.initial.cameras, true.cameras, strict=True):
-        assert start.params[0] == pytest.approx(1.03 * camera.params[0])
-        assert start.params[1] == start.params[0]
-        assert np.linalg.norm(start.params[2:4] - camera.params[2:4]) == pytest.approx(6.0)
-        assert (start.params[4:] == 0).all()
-    placed = list(zip(problem.initial.rig_from_world, true.rig_from_world, strict=True))
-    angles = np.array([angle_between(a.rotation, b.rotation) for a, b in placed])
-    assert np.rad2deg(np.sqrt(np.square(angles).mean() / 3)) == pytest.approx(1.0, rel=0.4)
-    off = (problem.initial.points - true.points).std()
-    assert off == pytest.approx(TRACKS.point_error_m, rel=0.1)
-    first = problem.initial.cam_from_rig[0]
-    np.testing.assert_array_equal(first.rotation, np.eye(3))
-    np.testing.assert_array_equal(first.translation, np.zeros(3))
-    assert problem.scale
-    true_m = np.linalg.norm(true.cam_from_rig[1].inverse.translation)
-    assert 0 < abs(problem.scale.length_m - true_m) < 5 * problem.scale.sigma_m
-
-
-def test_tracks_keep_their_limits() -> None:
-    options = TRACKS.model_copy(
-        update={"max_points_per_image": 50, "max_track_frames": 6, "min_track_length": 4}
-    )
-    problem, true = simulate_tracks(options, rng())
-    seen = problem.observations
-    images = np.unique(np.stack([seen.frame, seen.camera]), axis=1, return_counts=True)[1]
-    assert images.max() <= 50
-    assert np.bincount(seen.point, minlength=len(true.points)).min() >= 4
-    for point in range(len(true.points)):
-        frames = seen.frame[seen.point == point]
-        assert frames.max() - frames.min() < 6
-
-
-def test_frames_that_see_next_to_nothing_are_left_out() -> None:
-    options = TRACKS.model_copy(update={"points": 120, "max_track_frames": 5})
-    problem, true = simulate_tracks(options, rng(1))
-    seen = problem.observations
-    assert len(problem.frame_names) == len(true.rig_from_world) < options.frames
-    assert len(problem.initial.rig_from_world) == len(true.rig_from_world)
-    counts = np.bincount(seen.frame, minlength=len(problem.frame_names))
-    assert counts.min() >= MIN_OBSERVATIONS_A_FRAME
-    assert np.abs(residuals_px(true, seen)).max() < 6 * options.sigma_px
-
-
-def test_same_seed_gives_same_tracks(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_tracks(*simulate_tracks(TRACKS, rng(7)), tmp_path / name)
-    assert files_below(tmp_path / "a") == files_below(tmp_path / "b")
-
-
-@pytest.mark.parametrize("rig", ["mono", "triple"])
-def test_tracks_survive_the_file(rig: str, tmp_path: Path) -> None:
-    problem, true = simulate_tracks(TRACKS.model_copy(update={"rig": rig}), rng())
-    write_tracks(problem, true, tmp_path)
-    again, true_again = read_tracks(tmp_path)
-    np.testing.assert_array_equal(
-        residuals_px(true_again, again.observations), residuals_px(true, problem.observations)
-    )
-    np.testing.assert_array_equal(
-        residuals_px(again.initial, again.observations),
-        residuals_px(problem.initial, problem.observations),
-    )
-    assert again.scale == problem.scale
-    assert again.frame_names == problem.frame_names
-    calibration = load_calibration(tmp_path / "truth.json")
-    np.testing.assert_array_equal(calibration.camera("cam0").params, true.cameras[0].params)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"frames": 0}, "frames is 0: give 1"),
-        ({"points": 0}, "points is 0: give 1"),
-        ({"min_track_length": 1}, "min_track_length is 1: give 2"),
-        ({"size": (32, 480)}, "32 x 480 px: give"),
-        ({"outlier_share": 1.0}, "outlier_share is 1.0: give"),
-        ({"sigma_px": -0.5}, "sigma_px is -0.5: give"),
-        ({"focal_error": -1.0}, "focal_error is -1.0: give"),
-        ({"frames": 1, "rig": "mono"}, "no point of 1500 is seen 3 times in 1 frames: give"),
-    ],
-)
-def test_impossible_tracks_are_refused(change: dict[str, object], message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        simulate_tracks(TRACKS.model_copy(update=change), rng())
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no tracks at all", b"PK\x03\x04 cut short"])
-def test_files_that_hold_no_tracks_are_refused(content: bytes | None, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / "tracks.npz").write_bytes(content)
-    with pytest.raises(CalibrationError, match=r"tracks\.npz"):
-        read_tracks(tmp_path)

@@ -2,8 +2,8 @@
 
 Each pixel averages a grid of rays, each through the lens model. Embree finds what the pixel
 centres see; a kernel continues the other rays of a pixel on the triangles found there, and only
-pixels at the edge of an object cast all their rays. That is exact but for objects thinner than
-a pixel, and three times as fast.
+pixels at the edge of an object cast all their rays. Three times as fast as casting every ray;
+one pixel in ten thousand, at creases of the relief, then differs by more than the noise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from graphs.lenses import Camera, unproject
 from sfm_calib.simulate.room import Room
 from sfm_calib.simulate.textures import MIP_LEVELS, Float32, Grey
 
-EDGE_DEPTH_RATIO = 1.08  # neighbours further apart than this may hide something between them
+EDGE_DEPTH_RATIO = 1.03  # neighbours further apart than this may hide something between them
 OUTSIDE = 1e-4  # barycentric slack within which a ray counts as inside a triangle
 MIDDLE_GREY = 128.0
 # Distance to an image of 8 x 8 rays a pixel, in grey levels rms, four views of the room:
@@ -159,7 +159,7 @@ def _edges(triangle, distance, surface):  # type: ignore[no-untyped-def]
     return edge
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract","arcp","reassoc","nsz"})
+@njit(cache=True, error_model="numpy")
 def _barycentric(origin, dx, dy, dz, corner, edges, tri):  # type: ignore[no-untyped-def]
     """Barycentric a, b and the distance of a ray on a triangle's plane (Moeller, Trumbore 1997)."""
     e1x, e1y, e1z = edges[tri, 0, 0], edges[tri, 0, 1], edges[tri, 0, 2]
@@ -176,7 +176,7 @@ def _barycentric(origin, dx, dy, dz, corner, edges, tri):  # type: ignore[no-unt
     return a, b, (e2x * qx + e2y * qy + e2z * qz) * inverse
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract","arcp","reassoc","nsz"})
+@njit(cache=True, error_model="numpy")
 def _bilinear(texels, start, rows, columns, x, y):  # type: ignore[no-untyped-def]
     x = min(max(x, np.float32(0.0)), np.float32(columns - 1))
     y = min(max(y, np.float32(0.0)), np.float32(rows - 1))
@@ -188,7 +188,7 @@ def _bilinear(texels, start, rows, columns, x, y):  # type: ignore[no-untyped-de
     return top * (1 - fy) + bottom * fy
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract","arcp","reassoc","nsz"})
+@njit(cache=True, error_model="numpy")
 def _shade(dx, dy, dz, a, b, t, tri, pixel_rad, arrays, pyramid):  # type: ignore[no-untyped-def]
     """Texture, filtered to the sample's footprint, times the light, at a hit."""
     _, edges, uv, light, surface = arrays

@@ -21,6 +21,7 @@ Float32 = NDArray[np.float32]
 MIP_LEVELS = 7  # 1/64 of the finest: below a tenth of a cabin wall's texels nothing is left to see
 COARSEST_NOISE_M = 0.8  # larger patches would only push whole walls into black or white
 SMALLEST_LEAF_M, LARGEST_LEAF_M = 0.008, 0.3
+MOST_CORNERS = 8
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def pack(pictures: list[Grey]) -> TextureSet:
 
 
 def _leaves(canvas: Grey, texels_per_m: float, per_m2: float, rng: np.random.Generator) -> Float32:
-    """Polygons and ellipses of power-law size over the canvas, the largest first."""
+    """Polygons of power-law size over the canvas, the largest first."""
     rows, columns = canvas.shape
     count = max(8, round(per_m2 * rows * columns / texels_per_m**2))
     # density ~ r^-3, the scale-invariant law, by inverting its distribution function
@@ -95,14 +96,17 @@ def _leaves(canvas: Grey, texels_per_m: float, per_m2: float, rng: np.random.Gen
     # the smallest leaves would take nearly all of them: mix with a flatter law
     flat = np.exp(rng.uniform(np.log(SMALLEST_LEAF_M), np.log(LARGEST_LEAF_M), count))
     radii = np.where(rng.random(count) < 0.5, inverse_square**-0.5, flat) * texels_per_m
-    for radius in np.sort(radii)[::-1]:
-        corners = int(rng.integers(3, 9))
-        angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
-        reach = radius * rng.uniform(0.5, 1.0, corners)
-        centre = rng.uniform((0, 0), (columns, rows))
-        outline = centre + reach[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
-        grey = float(rng.uniform(25, 230))
-        cv2.fillPoly(canvas, [np.round(outline * 16).astype(np.int32)], grey, cv2.LINE_AA, 4)
+    corners = rng.integers(3, MOST_CORNERS + 1, count)
+    angles = rng.uniform(0, 2 * np.pi, (count, MOST_CORNERS))
+    reach = np.sort(radii)[::-1, None] * rng.uniform(0.5, 1.0, (count, MOST_CORNERS))
+    centres = rng.uniform((0, 0), (columns, rows), (count, 2))
+    greys = rng.uniform(25, 230, count).tolist()
+    for leaf in range(count):
+        n = corners[leaf]
+        around = np.sort(angles[leaf, :n])
+        ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+        outline = np.round((centres[leaf] + reach[leaf, :n, None] * ring) * 16).astype(np.int32)
+        cv2.fillPoly(canvas, [outline], greys[leaf], cv2.LINE_AA, 4)  # in sixteenths of a texel
     return canvas.astype(np.float32)
 
 

@@ -1,0 +1,7 @@
+"""`python -m sfm_calib`."""
+
+import sys
+
+from sfm_calib.cli import main
+
+sys.exit(main())

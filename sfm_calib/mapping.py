@@ -1,0 +1,161 @@
+"""From a scan to a Problem: features, matches, mapping, and one rig out of many poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphs.frames import Transform
+from graphs.lenses import Camera, LensName
+from graphs.problem import Problem
+from graphs.join import join_models
+from graphs.rig_start import FreeModel, impose_rig, link_cameras
+from sfm_calib import colmap
+from sfm_calib.cache import Cache
+from sfm_calib.config import RigConfig
+from sfm_calib.errors import CalibrationError
+from sfm_calib.files import sha256
+from sfm_calib.images import Progress, Scan
+from sfm_calib.pairs import choose_pairs
+
+ENOUGH_REGISTERED = 0.9  # of the images; fewer, and mapping starts again elsewhere
+MIN_MATCHES = 15  # COLMAP's own minimum for a verified pair
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A problem ready to be solved, and what was left out on the way."""
+
+    problem: Problem
+    messages: tuple[str, ...]
+    input_hashes: dict[str, str]
+
+
+def map_scan(
+    scan: Scan,
+    config: RigConfig,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    cache: Cache,
+    progress: Progress,
+) -> Mapped:
+    """Track features through the scan and derive the rig from freely posed images.
+
+    Raises CalibrationError when images do not overlap, or a camera cannot be placed.
+    """
+    hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
+    inputs = [
+        hashes, scan.cameras, scan.frames, lenses, config.max_features, config.pairs, config.seed,
+        {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
+    ]  # fmt: skip
+    tracks = cache.stage(
+        "tracks", inputs, lambda place: _track(scan, config, lenses, known, place, progress)
+    )
+    database = tracks / "database.db"
+    place = cache.stage(
+        "models", inputs, lambda place: _map(scan, config, database, place, progress)
+    )
+    models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
+    reference = scan.cameras.index(config.reference) if config.reference else 0
+    model, cam_from_rig = _one_model(scan, models, reference, database)
+    problem, dropped = impose_rig(model, cam_from_rig, scan.frames, reference)
+    return Mapped(problem, _messages(scan, model, dropped), hashes)
+
+
+def _track(
+    scan: Scan,
+    config: RigConfig,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    place: Path,
+    progress: Progress,
+) -> None:
+    database = place / "database.db"
+    colmap.extract_features(scan, lenses, known, database, config.max_features, progress)
+    pairs = choose_pairs(
+        scan,
+        config.pairs,
+        lambda i: colmap.read_descriptors(database, scan.images[i].path),
+        config.seed,
+    )
+    colmap.match_features(scan, pairs, database, config.seed, progress)
+    counts = colmap.match_counts(scan, database)
+    best = max(counts.values(), default=0)
+    if best < MIN_MATCHES:
+        raise CalibrationError(
+            f"no two of the {len(scan.images)} images overlap: the best pair has {best} verified "
+            f"matches (needs {MIN_MATCHES}); take the views closer together, of textured things"
+        )
+
+
+def _map(scan: Scan, config: RigConfig, database: Path, place: Path, progress: Progress) -> None:
+    """Map from several starts until most images are registered; keep the best start."""
+    best: tuple[int, int, int] | None = None
+    for number, attempt in enumerate(colmap.attempts(config.seed)):
+        trial = place / f"attempt{number}"
+        models = colmap.map_images(scan, database, trial, attempt, progress)
+        score = colmap.worth(models, scan)
+        if best is None or score > best:
+            best = score
+            colmap.write_models(models, place / "best")
+        if score[1] >= ENOUGH_REGISTERED * len(scan.images):
+            break
+    if best is None or best[1] == 0:
+        raise CalibrationError(
+            f"none of {len(scan.images)} images could be placed in {number + 1} attempts: "
+            f"{_overlap_in_words(scan, database)}; move the camera sideways between views"
+        )
+
+
+def _overlap_in_words(scan: Scan, database: Path) -> str:
+    counts = colmap.match_counts(scan, database)
+    matched = sum(count >= MIN_MATCHES for count in counts.values())
+    return f"{matched} pairs match, at most {max(counts.values(), default=0)} features each"
+
+
+def _one_model(
+    scan: Scan, models: Sequence[FreeModel], reference: int, database: Path
+) -> tuple[FreeModel, tuple[Transform, ...]]:
+    """The largest model, joined by the others where they hold cameras that it does not."""
+    model = models[0]
+    for other in models[1:]:
+        model = join_models(model, other)
+    cam_from_rig, missing = link_cameras(model, reference)
+    if missing:
+        raise CalibrationError(_lost_camera(scan, model, missing[0], database))
+    return model, cam_from_rig
+
+
+def _lost_camera(scan: Scan, model: FreeModel, camera: int, database: Path) -> str:
+    counts = colmap.match_counts(scan, database)
+    own = {i for i, image in enumerate(scan.images) if image.camera == camera}
+    within = [n for (a, b), n in counts.items() if a in own and b in own]
+    across = [n for (a, b), n in counts.items() if (a in own) != (b in own)]
+    placed = len(model.images_of(camera))
+    return (
+        f"camera {scan.cameras[camera]} could not be placed on the rig: {placed} of its {len(own)} "
+        f"images registered, at most {max(within, default=0)} matches among its own images and "
+        f"{max(across, default=0)} with other cameras (needs about 30); let it see textured things "
+        "that the other cameras see too, at some time of the scan"
+    )
+
+
+def _messages(scan: Scan, model: FreeModel, dropped: list[tuple[int, int]]) -> tuple[str, ...]:
+    messages = []
+    lost = [scan.name(i) for i in scan.images if (i.camera, i.frame) not in model.cam_from_world]
+    if lost:
+        messages.append(
+            f"{len(lost)} of {len(scan.images)} images could not be placed: {_some(lost)}"
+        )
+    odd = [f"{scan.cameras[camera]}/{scan.frames[frame]}" for camera, frame in dropped]
+    if odd:
+        messages.append(
+            f"{len(odd)} images contradict the rig and were dropped (a wrong place, or not taken "
+            f"together with the rest of their frame): {_some(odd)}"
+        )
+    return tuple(messages)
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

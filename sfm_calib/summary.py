@@ -1,0 +1,189 @@
+"""What is said of an optimum: the numbers with their sigmas, and whether to use them."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+
+import sfm_calib
+from graphs.covariance import CalibrationCovariance, Covariance
+from graphs.frames import Transform
+from graphs.problem import residuals_px
+from graphs.refine import Refinement
+from graphs.scale import baseline_unit, in_unit_baseline
+from sfm_calib import result
+from sfm_calib.config import RigConfig
+from sfm_calib.images import Scan
+from sfm_calib.mapping import Mapped
+
+PRIOR_DECIDES = 0.5  # of the prior's variance left: the data have said less than the belief
+FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
+LIBRARIES = ("gtsam", "pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything a finished calibration knows of itself."""
+
+    scan: Scan
+    config: RigConfig
+    mapped: Mapped
+    refinement: Refinement
+    covariance: CalibrationCovariance
+    seconds: dict[str, float]
+    command: str
+
+
+def summarise(run: Run) -> tuple[result.Calibration, float]:
+    """The result file of a run, and its lengths over the optimum's.
+
+    Non-metric rigs are put into units of their longest baseline.
+    """
+    estimate, problem = run.refinement.estimate, run.refinement.problem
+    covariance, cam_from_rig, unit = run.covariance.stated, estimate.cam_from_rig, 1.0
+    far = None if problem.scale else baseline_unit(estimate, problem.reference, covariance)
+    if far is not None:
+        covariance = in_unit_baseline(covariance, estimate, far)
+        unit = 1.0 / float(np.linalg.norm(cam_from_rig[far].translation))
+        cam_from_rig = tuple(t.scaled(unit) for t in cam_from_rig)
+    calibration = result.Calibration(
+        cameras=_cameras(run, covariance),
+        rig=_rig(run, cam_from_rig, covariance, far),
+        covariance=result.Covariance(
+            names=covariance.names, matrix=tuple(map(tuple, covariance.matrix.tolist()))
+        ),
+        noise=result.Noise(sigma_px=run.refinement.sigma_px, inflation=run.covariance.inflation),
+        verdict=_verdict(run, covariance),
+        solve=_solve(run),
+        provenance=_provenance(run),
+    )
+    return calibration, unit
+
+
+def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]:
+    graph, seen = run.refinement.graph, run.refinement.problem.observations
+    sigma = covariance.sigma
+    entries = {}
+    for index, camera in enumerate(run.refinement.estimate.cameras):
+        own = {p: sigma.get(f"{camera.name}.{p}", 0.0) for p in camera.names}
+        prior = graph.lens_priors[index]
+        prior_sigma = np.sqrt(np.diag(np.linalg.inv(prior.information())))
+        share = {
+            p: min(own[p] ** 2 / float(s) ** 2, 1.0) if free else 1.0
+            for p, s, free in zip(camera.names, prior_sigma, prior.free, strict=True)
+        }
+        if np.isfinite(prior.aspect_sigma):
+            ratio = covariance.of_difference(f"{camera.name}.fy", f"{camera.name}.fx")
+            share["fy/fx"] = min((ratio / camera.params[0] / prior.aspect_sigma) ** 2, 1.0)
+        rows = seen.camera == index
+        entries[camera.name] = result.CameraResult(
+            lens=camera.lens,
+            size=camera.size,
+            params=camera.named(),
+            sigma=own,
+            prior_share=share,
+            n_images=len(np.unique(seen.frame[rows])),
+            n_observations=int(rows.sum()),
+        )
+    return entries
+
+
+def _rig(
+    run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance, far: int | None
+) -> result.RigResult:
+    problem, names = run.refinement.problem, run.scan.cameras
+    sigma = covariance.sigma
+    transforms = {}
+    for name, transform in zip(names, cam_from_rig, strict=True):
+        turn = [np.degrees(sigma.get(f"{name}.rotation_{axis}", 0.0)) for axis in "xyz"]
+        move = [sigma.get(f"{name}.translation_{axis}", 0.0) for axis in "xyz"]
+        transforms[name] = result.CamFromRig(
+            rotation_wxyz=tuple(transform.rotation_wxyz.tolist()),
+            translation=tuple(transform.translation.tolist()),
+            sigma_rotation_deg=tuple(turn),
+            sigma_translation=tuple(move),
+        )
+    reference = names[problem.reference]
+    scale = result.Scale(source="none: one camera has no length")
+    if problem.scale is not None:
+        measured, pair = problem.scale, [names[i] for i in problem.scale.cameras]
+        scale = result.Scale(
+            source=f"baseline {pair[0]} to {pair[1]}: {measured.length_m:g} m",
+            sigma_relative=measured.sigma_m / measured.length_m,
+        )
+    elif far is not None:
+        scale = result.Scale(source=f"none: unit is the baseline {reference} to {names[far]}")
+    elif len(names) > 1:
+        scale = result.Scale(source="none: the cameras sit too close together to give a unit")
+    return result.RigResult(
+        reference=reference,
+        cam_from_rig=transforms,
+        metric=problem.scale is not None,
+        scale=scale,
+    )
+
+
+def _verdict(run: Run, covariance: Covariance) -> result.Verdict:
+    refinement, problem = run.refinement, run.refinement.problem
+    messages = [*run.scan.warnings, *run.mapped.messages]
+    if not refinement.summary.converged:
+        messages.append(f"the solve did not converge: {refinement.summary.reason}")
+    if len(problem.frame_names) < FEW_FRAMES:
+        messages.append(
+            f"only {len(problem.frame_names)} frames: sigmas rest on how much frames differ, and "
+            f"fewer than {FEW_FRAMES} show that poorly; expect errors above the stated sigmas"
+        )
+    weak = [
+        result.WeakDirection(
+            what=f"{name}.{parameter}",
+            effect_px=entry.sigma[parameter] if parameter in ("cx", "cy") else None,
+            remedy="turn the camera about its optical axis between views"
+            if parameter in ("cx", "cy")
+            else "cover the image corners, and near and far things",
+        )
+        for name, entry in _cameras(run, covariance).items()
+        for parameter, share in entry.prior_share.items()
+        if share > PRIOR_DECIDES
+        and parameter not in camera_fixed(run.config, name)
+        and parameter != "fy/fx"
+    ]
+    return result.Verdict(
+        usable=refinement.summary.converged, weak=tuple(weak), messages=tuple(messages)
+    )
+
+
+def camera_fixed(config: RigConfig, name: str) -> tuple[str, ...]:
+    """Parameters that rig.yaml holds."""
+    return config.cameras[name].fixed if name in config.cameras else ()
+
+
+def _solve(run: Run) -> result.Solve:
+    refinement, seen = run.refinement, run.refinement.problem.observations
+    residuals = residuals_px(refinement.estimate, seen)
+    return result.Solve(
+        converged=refinement.summary.converged,
+        reason=refinement.summary.reason,
+        iterations=refinement.iterations,
+        rms_px=float(np.sqrt(np.nanmean((residuals**2).sum(1)))),
+        n_frames=len(refinement.problem.frame_names),
+        n_images=len(np.unique(seen.frame * len(run.scan.cameras) + seen.camera)),
+        n_points=len(refinement.estimate.points),
+        n_observations=len(seen),
+        n_rejected=refinement.n_rejected,
+        seconds=run.seconds,
+    )
+
+
+def _provenance(run: Run) -> result.Provenance:
+    return result.Provenance(
+        version=sfm_calib.__version__,
+        versions={"python": platform.python_version()}
+        | {name: version(name) for name in LIBRARIES},
+        command=run.command,
+        config=run.config.model_dump(mode="json"),
+        seed=run.config.seed,
+        input_hashes=run.mapped.input_hashes,
+    )
