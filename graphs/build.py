@@ -76,7 +76,8 @@ def _rig_prior_factor(camera: int, prior: RigPrior) -> gtsam.NonlinearFactor:
     sigmas = np.array([prior.sigma_rotation] * 3 + [prior.sigma_translation] * 3)
     sigmas = np.minimum(sigmas, NO_KNOWLEDGE)
     pose = to_gtsam_inverse(prior.cam_from_rig)
-    return gtsam.PriorFactorPose3(rig_key(camera), pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas, reference.NOT_SMART)
+    return gtsam.PriorFactorPose3(rig_key(camera), pose, noise)
 
 
 def initial_values(problem: Problem) -> gtsam.Values:

@@ -1,9 +1,12 @@
 """Joint covariance of all lenses and rig extrinsics, everything else marginalised, labelled.
 
-The linearised graph H = A'A is reduced exactly: points by their 3x3 blocks, then frames. The
+The linearised graph H = A'A is reduced exactly: points by projection, then frames. The
 model covariance assumes independent observations of the estimated noise; the clustered one
-(Liang and Zeger 1986; Cameron and Miller 2015) only that different frames err independently.
-The stated sigma is the larger of the two, parameter by parameter.
+only that observations err independently which share neither their frame nor their track: the
+two-way sandwich of Cameron, Gelbach and Miller (JBES 2011). The stated sigma is the larger of
+the two, parameter by parameter. On the rendered demo scan, z = error / sigma has an rms of 2.1
+with the model's sigma, 1.7 with frames as clusters, and 1.2 with both: a keypoint drifts off
+its corner as the view changes, and takes its whole track along.
 """
 
 from __future__ import annotations
@@ -18,14 +21,15 @@ import scipy.sparse
 from graphs.build import CalibrationGraph
 from graphs.frames import FloatArray, reported_from_tangent
 from graphs.keys import frame_key, lens_key, point_key, rig_key
-from graphs.noise import loss_moments, redundancy
-from graphs.problem import Estimate, IntArray, residuals_px
+from graphs.noise import loss_moments
+from graphs.problem import Estimate, IntArray, Observations, residuals_px
 from graphs.reference import NATIVE_SIZE, native_slots
 
 POSE_NAMES = (
     *(f"rotation_{axis}" for axis in "xyz"),
     *(f"translation_{axis}" for axis in "xyz"),
 )
+RANK_TOLERANCE = 1e-13  # of a point's strongest direction: below, rounding
 MIN_CLUSTERS = 5  # fewer frames cannot show how much frames differ
 
 
@@ -74,22 +78,17 @@ def calibration_covariance(
     system = linearised_system(graph, values)
     n_rows = 2 * len(problem.observations)
     scale = np.ones(system.jacobian.shape[0])
-    scale[:n_rows] = moments.variance_factor**-0.5
+    scale[:n_rows] = moments.curvature**0.5
     columns, names, to_reported = _calibration_columns(graph, estimate, system.first_column)
-    influence = solve_normal_equations(system, scale, columns)
-    model = Covariance(names, to_reported @ influence[columns] @ to_reported.T)
-    gain = moments.variance_factor**-0.5 / moments.curvature  # on rows already scaled once
-    scores = (scipy.sparse.diags_array(scale) @ system.jacobian) @ influence
-    frames = problem.observations.frame
-    clustered = clustered_covariance(
-        scores, system.rhs * np.where(np.arange(len(scale)) < n_rows, gain, 1.0), frames
-    )
-    clustered *= 1 / redundancy(problem)
-    prior_rows = scores[n_rows:]
-    clustered = to_reported @ (clustered + prior_rows.T @ prior_rows) @ to_reported.T
-    if len(np.unique(frames)) < MIN_CLUSTERS:
+    scores = influence(system, scale, columns) @ to_reported.T
+    of_data, of_priors = scores[:n_rows], scores[n_rows:].T @ scores[n_rows:]
+    model = Covariance(names, moments.score_variance * of_data.T @ of_data + of_priors)
+    seen = problem.observations
+    if len(np.unique(seen.frame)) < MIN_CLUSTERS:
         return CalibrationCovariance(model, model)
-    return CalibrationCovariance(Covariance(names, _widen(model.matrix, clustered)), model)
+    clustered = moments.refit * clustered_variance(of_data, system.rhs[:n_rows], seen)
+    widened = _widen(model.matrix, clustered + np.diag(of_priors))
+    return CalibrationCovariance(Covariance(names, widened), model)
 
 
 @dataclass(frozen=True)
@@ -129,59 +128,78 @@ def linearised_system(graph: CalibrationGraph, values: gtsam.Values) -> Linearis
     )
 
 
-def solve_normal_equations(
-    system: LinearisedSystem, row_scale: FloatArray, columns: IntArray
-) -> FloatArray:
-    """Columns of the inverse of A' diag(row_scale)^2 A, (n_columns, len(columns)).
+def influence(system: LinearisedSystem, row_scale: FloatArray, columns: IntArray) -> FloatArray:
+    """What a unit of each row's error does to the unknowns `columns`, (n_rows, len(columns)).
 
-    The points' 3x3 blocks are eliminated first, the rest is dense; scaled to a unit diagonal
-    so that pixels, radians and distortion coefficients are inverted equally well.
+    A (A' W A)^-1 with W = diag(row_scale)^2. Points are projected out, row by row and stably;
+    the rest is dense, scaled to a unit diagonal so that pixels, radians and distortion
+    coefficients are inverted equally well.
     """
-    scaled = scipy.sparse.diags_array(row_scale) @ system.jacobian
-    norms = np.sqrt(np.asarray(scaled.multiply(scaled).sum(0)).ravel())
-    scaled = (scaled @ scipy.sparse.diags_array(1 / norms)).tocsc()
-    is_point = np.zeros(scaled.shape[1], dtype=bool)
-    is_point[system.first_point : system.first_point + 3 * system.n_points] = True
-    points, others = np.flatnonzero(is_point), np.flatnonzero(~is_point)
-    a_points, a_others = scaled[:, points], scaled[:, others]
-    inverse_blocks = _inverse_point_blocks(a_points, system.n_points)
-    coupling = (a_points.T @ a_others).tocsr()  # (3 n_points, n_others)
-    eliminated = inverse_blocks @ coupling
-    reduced = (a_others.T @ a_others).toarray() - (coupling.T @ eliminated).toarray()
-    position = np.searchsorted(others, columns)
+    scaled = (scipy.sparse.diags_array(row_scale) @ system.jacobian).tocsc()
+    points = slice(system.first_point, system.first_point + 3 * system.n_points)
+    others = np.delete(np.arange(scaled.shape[1]), points)
+    basis = _point_basis(scaled[:, points], system.n_points)
+    a = scaled[:, others]
+    norms = np.sqrt(np.asarray(a.multiply(a).sum(0)).ravel())
+    a = (a @ scipy.sparse.diags_array(1 / norms)).tocsr()
+    along_points = (basis.T @ a).tocsr()  # (3 n_points, n_others)
+    reduced = (a.T @ a - along_points.T @ along_points).toarray()
+    place = np.searchsorted(others, columns)
     rhs = np.zeros((len(others), len(columns)))
-    rhs[position, np.arange(len(columns))] = 1.0
-    solution = np.zeros((scaled.shape[1], len(columns)))
-    factor = scipy.linalg.cho_factor(reduced)
-    solution[others] = scipy.linalg.cho_solve(factor, rhs)
-    solution[points] = -(eliminated @ solution[others])
-    return solution / norms[:, None] / norms[columns][None, :]
+    rhs[place, np.arange(len(columns))] = 1 / norms[place]
+    solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), rhs)
+    return (a @ solution - basis @ (along_points @ solution)) / row_scale[:, None]
 
 
-def _inverse_point_blocks(
-    a_points: scipy.sparse.csc_array, n_points: int
-) -> scipy.sparse.bsr_array:
-    blocks = (a_points.T @ a_points).tobsr((3, 3))
-    blocks.sort_indices()
-    inverse = np.linalg.inv(blocks.data)
-    return scipy.sparse.bsr_array((inverse, np.arange(n_points), np.arange(n_points + 1)))
+def _point_basis(a_points: scipy.sparse.csc_array, n_points: int) -> scipy.sparse.csr_array:
+    """Orthonormal basis (n_rows, 3 n_points) of what moving each point does to its rows.
 
-
-def clustered_covariance(scores: FloatArray, rhs: FloatArray, frames: IntArray) -> FloatArray:
-    """Sum over frames of the outer product of what each frame's errors do to the estimate.
-
-    scores (n_rows, n): what a unit of each row's error does; rhs (n_rows,): the errors; frames
-    (n_obs,): the frame of each observation, two rows each, first.
+    Not by normal equations: a mismatched track may end a micrometre before a camera, and the
+    square of its Jacobian drowns everything else.
     """
-    moved = (scores * rhs[:, None])[: 2 * len(frames)]
-    by_frame = np.zeros((int(frames.max()) + 1, scores.shape[1]))
-    np.add.at(by_frame, np.repeat(frames, 2), moved)
-    n_frames = len(np.unique(frames))
-    return by_frame.T @ by_frame * (n_frames / max(n_frames - 1, 1))
+    entries = a_points.tocoo()
+    blocks = np.zeros((a_points.shape[0], 3))
+    blocks[entries.row, entries.col % 3] = entries.data
+    owner = np.full(a_points.shape[0], n_points)  # of rows without a point: none
+    owner[entries.row] = entries.col // 3
+    by_owner = np.argsort(owner, kind="stable")
+    length = np.bincount(owner, minlength=n_points)[:n_points]
+    first = np.cumsum(length) - length
+    directions = np.zeros_like(blocks)
+    for size in np.unique(length[length > 0]):
+        starts = first[length == size]
+        rows = by_owner[starts[:, None] + np.arange(size)]  # (n_such, size)
+        left, spread, _ = np.linalg.svd(blocks[rows], full_matrices=False)
+        left *= (spread > RANK_TOLERANCE * spread[:, :1])[:, None, :]
+        directions[rows, : left.shape[2]] = left
+    row = np.repeat(np.flatnonzero(owner < n_points), 3)
+    column = (3 * owner[:, None] + np.arange(3))[owner < n_points].ravel()
+    return scipy.sparse.csr_array(
+        (directions[owner < n_points].ravel(), (row, column)), a_points.shape
+    )
 
 
-def _widen(model: FloatArray, clustered: FloatArray) -> FloatArray:
-    factor = np.sqrt(np.maximum(np.diag(clustered) / np.diag(model), 1.0))
+def clustered_variance(scores: FloatArray, rhs: FloatArray, seen: Observations) -> FloatArray:
+    """Variances (n,) when what shares a frame or a track may err together.
+
+    scores (2 n_obs, n): what a unit of each row's error does; rhs (2 n_obs,): the errors.
+    By frame plus by track less what both count, and never less than either alone.
+    """
+    moved = (scores * rhs[:, None]).reshape(len(seen), 2, -1).sum(1)
+    by_frame, by_track = _sum_of_squares(moved, seen.frame), _sum_of_squares(moved, seen.point)
+    return np.maximum(by_frame + by_track - (moved**2).sum(0), np.maximum(by_frame, by_track))
+
+
+def _sum_of_squares(moved: FloatArray, cluster: IntArray) -> FloatArray:
+    """Sum over clusters of the square of what each cluster's errors do together (n,)."""
+    together = np.zeros((int(cluster.max()) + 1, moved.shape[1]))
+    np.add.at(together, cluster, moved)
+    n_clusters = len(np.unique(cluster))
+    return (together**2).sum(0) * (n_clusters / max(n_clusters - 1, 1))
+
+
+def _widen(model: FloatArray, variance: FloatArray) -> FloatArray:
+    factor = np.sqrt(np.maximum(variance / np.diag(model), 1.0))
     return model * factor[:, None] * factor[None, :]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from graphs.frames import Transform, to_gtsam_inverse
 from graphs.keys import frame_key, rig_key
 from graphs.problem import KnownBaseline, Problem
+from graphs.reference import NOT_SMART
 
 GAUGE_SIGMA = 1e-6  # of the scene's size, and in radians: far below any estimated sigma
 
@@ -47,7 +48,7 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     """Hold seven degrees of freedom and the reference camera; a scale source replaces the size."""
     gauge = choose_gauge(problem)
     sigma = GAUGE_SIGMA * gauge.distance
-    held = gtsam.noiseModel.Diagonal.Sigmas(np.array([GAUGE_SIGMA] * 3 + [sigma] * 3))
+    held = gtsam.noiseModel.Diagonal.Sigmas(np.array([GAUGE_SIGMA] * 3 + [sigma] * 3), NOT_SMART)
     pose = to_gtsam_inverse(problem.initial.rig_from_world[gauge.frame])
     graph.add(gtsam.PriorFactorPose3(frame_key(gauge.frame), pose, held))
     identity = to_gtsam_inverse(Transform.identity())

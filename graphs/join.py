@@ -17,6 +17,9 @@ from graphs.rig_start import FreeModel, median_transform
 
 MIN_FRAMES = 4  # three motions: two to solve, one to notice
 MIN_TURN_DEG = 5.0  # about a second axis; below, translation along the first is not determined
+# Turning about one point of the rig (a pan-tilt head; an orbit, nearly: 0.028) any scale fits.
+# Below, errors of the motions are magnified a hundredfold; handheld scans have 0.3 to 0.7.
+MIN_INDEPENDENCE = 0.01
 
 
 def join_models(main: FreeModel, other: FreeModel) -> FreeModel:
@@ -56,7 +59,7 @@ def hand_eye(
 ) -> tuple[Transform, float] | None:
     """b_from_a and the factor that brings b's lengths into a's, from poses of the same frames.
 
-    None when the frames are fewer than MIN_FRAMES or turn about a single axis.
+    None when the frames are fewer than MIN_FRAMES, or turn about a single axis or a single point.
     """
     if len(a_from_world) < MIN_FRAMES:
         return None
@@ -76,7 +79,11 @@ def hand_eye(
     for a, b in motions:  # (R_b - I) t + scale t_b = R t_a
         rows.append(np.column_stack([b.rotation - np.eye(3), b.translation]))
         values.append(rotation @ a.translation)
-    solution: FloatArray = np.linalg.lstsq(np.vstack(rows), np.concatenate(values))[0]
+    system = np.vstack(rows)
+    lengths = np.maximum(np.linalg.norm(system, axis=0), 1e-300)
+    if np.linalg.svd(system / lengths, compute_uv=False)[-1] < MIN_INDEPENDENCE:
+        return None
+    solution: FloatArray = np.linalg.lstsq(system, np.concatenate(values))[0]
     if solution[3] <= 0:
         return None
     return Transform(rotation, solution[:3]), float(solution[3])

@@ -74,8 +74,10 @@ def project(camera: Camera, points: FloatArray) -> FloatArray:
         if camera.lens == "kannala_brandt":
             radius = np.hypot(x, y)
             theta = np.arctan2(radius, z)
-            scale = np.where(radius > 1e-12, _fisheye_angle(camera, theta) / radius, 1.0 / z)
-            a, b, valid = x * scale, y * scale, theta <= valid_limit(camera)
+            off_axis = radius > 1e-12 * np.abs(z)
+            scale = np.where(off_axis, _fisheye_angle(camera, theta) / radius, 1.0 / z)
+            a, b = x * scale, y * scale
+            valid = (theta <= valid_limit(camera)) & (off_axis | (z > 0))
         else:
             a, b = x / z, y / z
             valid = (z > 0) & (np.hypot(a, b) <= valid_limit(camera))
@@ -108,7 +110,8 @@ UNPROJECT_ITERATIONS = 20
 def valid_limit(camera: Camera) -> float:
     """The largest normalised radius (fisheye: angle in radians) before the lens folds back.
 
-    First positive zero of d r_distorted / d r, a polynomial in r^2; infinity when there is none.
+    First positive zero of d r_distorted / d r, a polynomial in r^2 (in 1 / r^2, reversed, its
+    leading coefficient is one, however small the last); infinity when there is none.
     """
     if camera.lens == "kannala_brandt":
         coefficients = [
@@ -119,9 +122,9 @@ def valid_limit(camera: Camera) -> float:
     else:
         k1, k2 = _radial(camera)
         coefficients, cap = [1.0, 3 * k1, 5 * k2], np.inf
-    roots = np.roots(np.trim_zeros(coefficients[::-1], "f"))
-    real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
-    return float(min(np.sqrt(real.min()), cap)) if real.size else float(cap)
+    roots = np.roots(coefficients)
+    real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 1e-12)]
+    return float(min(real.max() ** -0.5, cap)) if real.size else float(cap)
 
 
 def _radial(camera: Camera) -> tuple[float, float]:

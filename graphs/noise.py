@@ -40,19 +40,28 @@ def robust_sigma_px(problem: Problem, residuals: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class LossMoments:
-    """What an M-estimator's weights do to its covariance (Huber, Robust Statistics, 1981, 7.6)."""
+    """What an M-estimator's weights do to its covariance (Huber, Robust Statistics, 1981, 7.6).
 
-    curvature: float  # true curvature of the loss over the weight used in its place
-    variance_factor: float  # of the data's information: 1 when noise and loss are as assumed
+    With H the weighted information of the data and P that of the priors, the cost has the
+    Hessian c H + P and its gradient the covariance s H + P.
+    """
+
+    curvature: float  # c: true curvature of the loss over the weight used in its place
+    score_variance: float  # s: both are 1 for Gaussian noise of the assumed sigma and no loss
+    refit: float  # already in s: squared scores of the noise over those of the residuals
 
 
 def loss_moments(problem: Problem, options: GraphOptions, residuals: FloatArray) -> LossMoments:
-    """Curvature and variance factor of the loss at the residuals (n_obs, 2) of the optimum."""
+    """Curvature and score variance of the loss at the residuals (n_obs, 2) of the optimum."""
     r = np.linalg.norm(residuals[np.isfinite(residuals).all(1)], axis=1) / options.sigma_px
     weight, slope = loss_weight_and_slope(options, r)
-    curvature = float(np.mean((slope + weight) / 2) / np.mean(weight))
-    score = float(np.mean((weight * r) ** 2) / 2 / redundancy(problem))
-    return LossMoments(curvature, score / float(np.mean(weight)) / curvature**2)
+    mean, apart = (slope + weight) / 2, (slope - weight) / 2  # curvature along and across
+    curvature = float(np.mean(mean))
+    scatter = float(np.mean(mean**2 + apart**2 / 2)) - curvature**2
+    left = redundancy(problem)
+    refit = (1 + (1 - left) * scatter / curvature**2) ** 2 / left  # Huber's K^2 n / (n - p)
+    score, used = float(np.mean((weight * r) ** 2) / 2), float(np.mean(weight))
+    return LossMoments(curvature / used, refit * score / used, refit)
 
 
 def loss_weight_and_slope(options: GraphOptions, r: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -18,6 +18,8 @@ from graphs.priors import PINNED_SIGMA, LensPrior
 from graphs.problem import Problem
 
 NATIVE_SIZE = 9
+# "Smart" noise models turn sigmas below 1e-8 into hard constraints, on which GTSAM's LM is stuck.
+NOT_SMART = False
 _BROWN_SLOTS = {"fx": 0, "fy": 1, "cx": 3, "cy": 4, "k1": 5, "k2": 6, "p1": 7, "p2": 8}
 _FISHEYE_SLOTS = {"fx": 0, "fy": 1, "cx": 3, "cy": 4, "k1": 5, "k2": 6, "k3": 7, "k4": 8}
 
@@ -38,9 +40,11 @@ def native_lens(camera: Camera) -> gtsam.Cal3DS2 | gtsam.Cal3Fisheye:
 
 def lens_params(values: gtsam.Values, index: int, camera: Camera) -> FloatArray:
     """The lens's own parameters (n_params,) out of GTSAM's values."""
-    fisheye = camera.lens == "kannala_brandt"
-    read = values.atCal3Fisheye if fisheye else values.atCal3DS2
-    return read(lens_key(index)).vector()[native_slots(camera)]
+    if camera.lens == "kannala_brandt":  # its vector() in Python is the base class's, five long
+        native = values.atCal3Fisheye(lens_key(index))
+        coefficients = (native.k1(), native.k2(), native.k3(), native.k4())
+        return np.array([native.fx(), native.fy(), native.px(), native.py(), *coefficients])
+    return values.atCal3DS2(lens_key(index)).vector()[native_slots(camera)]
 
 
 def lens_prior_factor(index: int, camera: Camera, prior: LensPrior) -> gtsam.NonlinearFactor:
@@ -49,7 +53,8 @@ def lens_prior_factor(index: int, camera: Camera, prior: LensPrior) -> gtsam.Non
     slots = native_slots(camera)
     information[np.ix_(slots, slots)] = prior.information()
     mean = native_lens(Camera(camera.name, camera.lens, camera.size, prior.mean))
-    noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.cholesky(information).T)
+    root = np.linalg.cholesky(information).T
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, NOT_SMART)
     fisheye = camera.lens == "kannala_brandt"
     kind = gtsam.PriorFactorCal3Fisheye if fisheye else gtsam.PriorFactorCal3DS2
     return kind(lens_key(index), mean, noise)

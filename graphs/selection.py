@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
 from graphs.problem import Estimate, IntArray, Observations, Problem
@@ -27,6 +28,59 @@ def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
             f"{min_parallax_deg:g} deg of parallax: move the camera sideways, closer to things"
         )
     return compact(problem, seen.subset(keep[seen.point]))
+
+
+GRID = 8  # cells a side over which an image's observations are spread
+
+
+def within_budget(problem: Problem, max_observations: int) -> Problem:
+    """The problem with the tracks that say most, at most `max_observations` of them together.
+
+    Long tracks first, as long as they fall into a part of some image that still lacks
+    observations; then long tracks anywhere. Random order breaks no ties: the result is the same
+    every time.
+    """
+    seen = problem.observations
+    if len(seen) <= max_observations:
+        return problem
+    size = np.array([camera.size for camera in problem.initial.cameras])[seen.camera]
+    cell = np.clip((seen.pixels / size * GRID).astype(np.int64), 0, GRID - 1)
+    image = seen.frame * len(problem.initial.cameras) + seen.camera
+    place = (image * GRID + cell[:, 1]) * GRID + cell[:, 0]
+    quota = max(max_observations // (len(np.unique(image)) * GRID * GRID), 1)
+    order = np.argsort(seen.point, kind="stable")
+    length = np.bincount(seen.point, minlength=len(problem.initial.points))
+    by_length = np.argsort(-length, kind="stable")
+    begins = np.cumsum(length) - length
+    keep = _spread(place[order], begins, length, by_length, quota, max_observations)
+    return compact(problem, seen.subset(keep[seen.point]))
+
+
+@njit(cache=True)
+def _spread(
+    place: IntArray,
+    begins: IntArray,
+    length: IntArray,
+    order: IntArray,
+    quota: int,
+    budget: int,
+) -> NDArray[np.bool_]:
+    filled = np.zeros(place.max() + 1, np.int64)
+    keep = np.zeros(len(length), np.bool_)
+    total = 0
+    for lacking_only in (True, False):
+        for point in order:
+            n = length[point]
+            if keep[point] or n == 0 or total + n > budget:
+                continue
+            cells = place[begins[point] : begins[point] + n]
+            if lacking_only and np.sum(filled[cells] < quota) * 2 < n:
+                continue
+            keep[point] = True
+            total += n
+            for cell in cells:
+                filled[cell] += 1
+    return keep
 
 
 def compact(problem: Problem, observations: Observations) -> Problem:

@@ -19,6 +19,8 @@ RELATIVE_COST_TOLERANCE = 1e-9  # below it, no parameter moves by a hundredth of
 
 @dataclass(frozen=True)
 class SolveSummary:
+    """How a solve went; `reason` says in words why it ended."""
+
     converged: bool
     reason: str
     iterations: int
@@ -48,6 +50,9 @@ def solve(
             on_iteration(iteration, cost)
         if not np.isfinite(cost):
             reason = "the cost is not finite"
+            break
+        if optimizer.lambda_() > params.getlambdaUpperBound():
+            reason = "no step lowers the cost: the linear system cannot be solved"
             break
         if previous - cost <= relative_tolerance * previous:
             reason = "converged"

@@ -6,10 +6,14 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from sfm_calib.errors import CalibrationError
+from sfm_calib.files import write_atomically
+
+DISK_IS_FULL = 1_000_000  # bytes free
 
 
 @dataclass(frozen=True)
@@ -22,25 +26,53 @@ class Cache:
     def stage(self, name: str, inputs: object, make: Callable[[Path], None]) -> Path:
         """The stage's folder, filled by `make(folder)` unless `inputs` are those of last time.
 
-        The key is written last, so a run cut short leaves nothing that looks complete.
+        The key is written last, so a run cut short leaves nothing that looks complete; a stage
+        that fails is removed, because it may be what fills the disk.
         Raises CalibrationError when the disk is full.
         """
         place, key_file = self.folder / name, self.folder / f"{name}.key"
         key = key_of(inputs)
-        if not self.fresh and key_file.exists() and key_file.read_text() == key:
+        if not self.fresh and place.is_dir() and _text(key_file) == key:
             return place
         try:
             key_file.unlink(missing_ok=True)
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
             make(place)
-            key_file.write_text(key)
-        except OSError as error:
+            write_atomically(key_file, key)
+        except BaseException as error:
+            reason = _disk_trouble(place, error)
+            self._drop(place)
+            if reason is None:
+                raise
             raise CalibrationError(
-                f"cannot write {place}: {error.strerror}; free some space or choose another "
-                "output folder"
+                f"cannot write {place}: {reason}; free some space or choose another output folder"
             ) from error
         return place
+
+    def _drop(self, place: Path) -> None:
+        """Remove an unfinished stage, and the cache's folder where nothing else is in it."""
+        shutil.rmtree(place, ignore_errors=True)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+def _disk_trouble(place: Path, error: BaseException) -> str | None:
+    """What the disk did wrong; None when it is not to blame."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    if isinstance(error, Exception) and place.exists():
+        free = shutil.disk_usage(place).free
+        if free < DISK_IS_FULL:  # libraries say this in many ways, or not at all
+            return f"only {free / 1e6:.1f} MB are free"
+    return None
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError):
+        return None
 
 
 def key_of(inputs: object) -> str:

@@ -92,7 +92,8 @@ def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Re
             problem,
             options,
             config.min_parallax_deg,
-            lambda iteration, cost: progress("solving", iteration, 0),
+            config.max_observations,
+            on_iteration=lambda iteration, cost: progress("solving", iteration, 0),
         )
     except ValueError as error:
         raise CalibrationError(str(error)) from error

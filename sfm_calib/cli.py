@@ -4,34 +4,40 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 import tyro
 from pydantic import ValidationError
-from rich.console import Console
 
 import sfm_calib
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, calibrate
 from sfm_calib.colmap import quiet
-from sfm_calib.comparison import compare_with_truth
+from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, Options, RigConfig, first_problem, load_rig_config
 from sfm_calib.errors import CalibrationError
+from sfm_calib.images import camera_names, check_exists
 from sfm_calib.report import TruthRow, write_report
 from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks, write_tracks
-from sfm_calib.terminal import print_comparison, print_result, progress_bars
+from sfm_calib.terminal import print_comparison, print_result, progress_bars, result_console
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="OUT")]
 Verbose = Annotated[bool, tyro.conf.arg(aliases=("-v",))]
+LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 EXIT_BAD_INPUT = 2
+DEMO_FRAMES = 24
+DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the same result
 EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
 
 
@@ -48,7 +54,7 @@ class Calibrate:
     out: Out
     """Folder for the results."""
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
-    truth: Path | None = None
+    truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A truth.json to compare with, as `simulate` writes it."""
     fresh: bool = False
     """Ignore what earlier runs left in OUT/cache."""
@@ -107,33 +113,52 @@ def parse(argv: Sequence[str], options: Options | None = None) -> Command:
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
     )
-    return tyro.cli(  # type: ignore[no-any-return]
+    command: Command = tyro.cli(
         commands,
         prog="sfm-calib",
         args=list(argv),
-        description=f"{sfm_calib.__doc__} Version {sfm_calib.__version__}.",
+        description=f"{sfm_calib.__doc__} Version {sfm_calib.__version__}; --version prints it.",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
+    return command
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command. Exit codes: 0 done, 2 bad input, 130 interrupted."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments == ["--version"]:
+        print(f"sfm-calib {sfm_calib.__version__}")
+        return 0
+    quiet_decoders()
     try:
         run(parse(arguments), arguments)
     except CalibrationError as error:
         print(f"sfm-calib: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except ValidationError as error:
-        print(f"sfm-calib: {first_problem(error)}", file=sys.stderr)
+        print(f"sfm-calib: {first_problem(error, flag)}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except BrokenPipeError:  # `| head` has read enough, and the results are written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        print(f"sfm-calib: {error.filename or ''} {error.strerror or error}", file=sys.stderr)
+        place = f"{error.filename}: " if error.filename else ""
+        print(f"sfm-calib: {place}{error.strerror or error}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print("sfm-calib: interrupted; finished stages are kept for the next run", file=sys.stderr)
         return EXIT_INTERRUPTED
     return 0
+
+
+def flag(option: str) -> str:
+    """How an option is called on the command line."""
+    return f"--{option.replace('_', '-')}"
+
+
+def quiet_decoders() -> None:
+    """What OpenCV says of damaged files is said better by our own message."""
+    cv2.utils.logging.setLogLevel(0)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def run(command: Command, arguments: Sequence[str]) -> None:
@@ -154,16 +179,20 @@ def run(command: Command, arguments: Sequence[str]) -> None:
 
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
     """Calibrate a scan; flags go before rig.yaml, and rig.yaml before the defaults."""
+    check_exists(command.scan)
     from_file = load_rig_config(rig_file(command.scan))
     again = parse(arguments, from_file.options())
     assert isinstance(again, Calibrate)
     config = from_file.with_options(again.options)
     truth = load_calibration(command.truth) if command.truth else None
-    outcome = calibrate_into(
-        command.out, command.scan, config, command.fresh, command.verbose, arguments
-    )
-    rows = compare_with_truth(outcome.calibration, truth) if truth else []
-    finish(outcome, command.out, rows, command.json)
+    if truth:
+        check_same_cameras(camera_names(command.scan), truth)  # now rather than after the work
+    with output_folder(command.out):
+        outcome = calibrate_into(
+            command.out, command.scan, config, command.fresh, command.verbose, arguments
+        )
+        rows = compare_with_truth(outcome.calibration, truth) if truth else []
+        finish(outcome, command.out, rows, command.json)
 
 
 def rig_file(scan: Path) -> Path:
@@ -180,52 +209,89 @@ def calibrate_into(
     arguments: Sequence[str],
 ) -> Outcome:
     """Calibrate with the cache in OUT/cache, under progress bars."""
-    check_writable(out)
     quiet(verbose)
-    command = shlex.join(["sfm-calib", *arguments])
+    command = shlex.join(["sfm-calib", *arguments]).encode(errors="backslashreplace").decode()
     with progress_bars() as progress:
         return calibrate(scan, config, Cache(out / "cache", fresh), progress, command)
 
 
-def check_writable(out: Path) -> None:
-    """Raises CalibrationError now rather than after the work when OUT cannot be written."""
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """OUT, made where it is missing, and gone again where nothing was written to it.
+
+    Raises CalibrationError now rather than after the work when OUT cannot be written.
+    """
+    missing = [path for path in (out, *out.parents) if not path.exists()]
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise CalibrationError(
-            f"cannot write to {out}: {error.strerror}; choose another output folder with -o"
-        ) from error
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=out):
+                pass
+            free = shutil.disk_usage(out).free
+        except OSError as error:
+            reason = "it is a file" if out.is_file() else error.strerror
+            raise CalibrationError(
+                f"cannot write to {out}: {reason}; choose another output folder with -o"
+            ) from error
+        if free < LEAST_FREE:
+            raise CalibrationError(
+                f"only {free / 1e6:.1f} MB are free in {out}, and results need "
+                f"{LEAST_FREE / 1e6:.0f} MB at least: free some space or choose another output "
+                "folder with -o"
+            )
+        yield
+    finally:
+        with suppress(OSError):  # as soon as one of them holds something
+            for path in missing:
+                path.rmdir()
 
 
 def finish(outcome: Outcome, out: Path, rows: Sequence[TruthRow], as_json: bool) -> None:
-    """Write calibration.json and report.html, and print the result."""
-    refinement, calibration = outcome.refinement, outcome.calibration
-    scaled = refinement.estimate.scaled(outcome.unit)
-    save_calibration(calibration, out / "calibration.json")
-    write_report(calibration, refinement.problem, scaled, out / "report.html", rows)
+    """Write calibration.json and report.html, both or none, and print the result."""
+    calibration = outcome.calibration
+    write_results(outcome, out, rows)
     if as_json:
         print(calibration.model_dump_json(indent=1))
         return
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = result_console()
     print_result(calibration, console)
     if rows:
         print_comparison(rows, console)
     console.print(f"{out / 'calibration.json'} and {out / 'report.html'} written", soft_wrap=True)
 
 
+def write_results(outcome: Outcome, out: Path, rows: Sequence[TruthRow]) -> None:
+    """The report is written under another name until calibration.json is in its place."""
+    refinement = outcome.refinement
+    scaled = refinement.estimate.scaled(outcome.unit)
+    report = out / ".report.html"
+    try:
+        write_report(outcome.calibration, refinement.problem, scaled, report, rows)
+        save_calibration(outcome.calibration, out / "calibration.json")
+        os.replace(report, out / "report.html")
+    finally:
+        report.unlink(missing_ok=True)
+
+
 def run_demo(command: Demo) -> None:
     """The main job on a scan whose truth is known."""
-    check_writable(command.out)
-    options = SimulateOptions(lens="radtan", seed=command.seed)
-    with progress_bars() as progress:
-        truth = simulate_scan(options, command.out, progress, overwrite=True)
-    scan = command.out / "scan"
-    config = load_rig_config(scan / RIG_FILE).model_copy(update={"seed": command.seed})
-    arguments = ["demo", "-o", os.fspath(command.out), "--seed", str(command.seed)]
-    outcome = calibrate_into(command.out, scan, config, False, command.verbose, arguments)
-    finish(outcome, command.out, compare_with_truth(outcome.calibration, truth), False)
+    out = command.out
+    if (out / "scan").exists() and not (out / "truth.json").exists():
+        raise CalibrationError(
+            f"{out / 'scan'} is no simulation, and the demo would replace it: choose another "
+            "output folder with -o"
+        )
+    options = SimulateOptions(lens="radtan", frames=DEMO_FRAMES, seed=command.seed)
+    with output_folder(out):
+        with progress_bars() as progress:
+            truth = simulate_scan(options, out, progress, overwrite=True)
+        scan = out / "scan"
+        config = load_rig_config(scan / RIG_FILE).model_copy(
+            update={"seed": command.seed, "max_features": DEMO_FEATURES}
+        )
+        arguments = ["demo", "-o", os.fspath(out), "--seed", str(command.seed)]
+        outcome = calibrate_into(out, scan, config, False, command.verbose, arguments)
+        finish(outcome, out, compare_with_truth(outcome.calibration, truth), False)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ integer pixel centres.
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import threading
 from collections.abc import Callable, Sequence
@@ -29,6 +31,7 @@ VERSION = pycolmap.__version__
 PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
+GLOBAL_ADJUSTMENT_GROWTH = 1.3  # of the model between two global adjustments
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
 # COLMAP's names of its parameters, where they are not ours.
@@ -55,6 +58,11 @@ def quiet(verbose: bool) -> None:
     """COLMAP's own log: all of it, or fatal errors alone."""
     pycolmap.logging.minloglevel = 0 if verbose else 3
     pycolmap.logging.logtostderr = True
+
+
+def is_verbose() -> bool:
+    """Whether COLMAP's own log is shown."""
+    return bool(pycolmap.logging.minloglevel == 0)
 
 
 def _cancellable(work: Callable[[Any], Any]) -> Any:
@@ -169,16 +177,26 @@ def match_features(
     pairing = pycolmap.ImportedPairingOptions()
     listing = database.with_name("pairs.txt")
     pairing.match_list_path = listing
+    # COLMAP cuts the lines of its list at blanks, which paths may hold and numbers do not.
+    numbers = {image.path: str(index) for index, image in enumerate(scan.images)}
+    _rename_images(database, numbers)
     for begin in range(0, len(pairs), PAIRS_A_BATCH):
         batch = pairs[begin : begin + PAIRS_A_BATCH]
-        lines = [f"{scan.images[a].path} {scan.images[b].path}\n" for a, b in batch]
-        listing.write_text("".join(lines))
+        listing.write_text("".join(f"{a} {b}\n" for a, b in batch))
         _cancellable(
             lambda token: pycolmap.match_image_pairs(
                 database, options, pairing, verification, pycolmap.Device.cpu, token
             )
         )
         progress("matching", begin + len(batch), len(pairs))
+    _rename_images(database, {number: path for path, number in numbers.items()})
+
+
+def _rename_images(database: Path, names: dict[str, str]) -> None:
+    with pycolmap.Database.open(database) as db:
+        for image in db.read_all_images():
+            image.name = names[image.name]
+            db.update_image(image)
 
 
 def match_counts(scan: Scan, database: Path) -> dict[Pair, int]:
@@ -209,12 +227,28 @@ def worth(models: Sequence[pycolmap.Reconstruction], scan: Scan) -> tuple[int, i
 
 
 def write_models(models: Sequence[pycolmap.Reconstruction], place: Path) -> None:
-    """Keep these models alone in `place`, the largest as 0."""
+    """Keep these models alone in `place`, the largest as 0.
+
+    Raises OSError when the disk is full, of which COLMAP says nothing.
+    """
     shutil.rmtree(place, ignore_errors=True)
     for number, model in enumerate(models):
         folder = place / str(number)
         folder.mkdir(parents=True)
         model.write(folder)
+        if not _is_whole(model, folder):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _is_whole(model: pycolmap.Reconstruction, folder: Path) -> bool:
+    try:
+        kept = pycolmap.Reconstruction(folder)
+    except (ValueError, IndexError, RuntimeError, MemoryError):
+        return False
+    return bool(
+        kept.num_points3D() == model.num_points3D()
+        and kept.num_reg_images() == model.num_reg_images()
+    )
 
 
 def read_models(place: Path) -> list[pycolmap.Reconstruction]:
@@ -250,6 +284,10 @@ def map_images(
     options.random_seed = attempt.seed
     options.mapper.random_seed = attempt.seed
     options.triangulation.random_seed = attempt.seed
+    # The graph has the last word: mapping may end less polished, in two thirds of the time.
+    options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_GROWTH
+    options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_GROWTH
+    options.ba_global_max_refinements = 2
     options.mapper.init_min_tri_angle = attempt.min_start_angle_deg
     options.mapper.init_max_forward_motion = attempt.max_start_forward
     pycolmap.set_random_seed(attempt.seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -19,17 +19,22 @@ def compare_with_truth(estimate: Calibration, truth: Calibration) -> list[TruthR
     A truth in metres is brought to the estimate's unit when the estimate is not metric.
     Raises CalibrationError when the cameras are not the same.
     """
-    if set(estimate.cameras) != set(truth.cameras):
-        raise CalibrationError(
-            f"the truth has cameras {', '.join(truth.cameras)}, the calibration "
-            f"{', '.join(estimate.cameras)}"
-        )
+    check_same_cameras(estimate.cameras, truth)
     rows = [row for name in estimate.cameras for row in _lens_rows(name, estimate, truth)]
     unit = _unit(estimate, truth)
     for name in estimate.cameras:
         if name != estimate.rig.reference:
             rows += _rig_rows(name, estimate, truth, unit)
     return rows
+
+
+def check_same_cameras(names: Collection[str], truth: Calibration) -> None:
+    """Raises CalibrationError when a truth is not of these cameras."""
+    if set(names) != set(truth.cameras):
+        raise CalibrationError(
+            f"the truth is of {len(truth.cameras)} cameras ({', '.join(truth.cameras)}) and the "
+            f"scan of {len(names)} ({', '.join(names)}): give the truth of this scan"
+        )
 
 
 def _row(name: str, estimate: float, truth: float, error: float, sigma: float) -> TruthRow:
@@ -52,7 +57,8 @@ def _unit(estimate: Calibration, truth: Calibration) -> float:
         return 1.0
     far = max(lengths, key=lambda n: lengths[n])
     relative = truth.cam_from_rig(far) @ truth.cam_from_rig(estimate.rig.reference).inverse
-    return float(np.linalg.norm(relative.translation) / lengths[far])
+    length = float(np.linalg.norm(relative.translation))
+    return length / float(lengths[far]) if length > 0 else 1.0
 
 
 def _rig_rows(

@@ -3,40 +3,47 @@
 from __future__ import annotations
 
 import difflib
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
+import tyro
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from graphs.build import LossName
 from graphs.lenses import LensName
+from graphs.refine import MAX_OBSERVATIONS
 from sfm_calib.errors import CalibrationError
 
 RIG_FILE = "rig.yaml"
+QUATERNION_TOLERANCE = 0.01  # typed by hand to two digits
 
 
 class Options(BaseModel):
     """How a scan is read, mapped and solved."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    lens: LensName | Literal["auto"] = "auto"
+    lens: Literal[LensName, "auto"] = "auto"
     """Lens of every camera that rig.yaml gives none; auto: radtan for a rig, radial for one."""
-    reference: str | None = None
+    reference: Annotated[str | None, tyro.conf.arg(metavar="CAMERA")] = None
     """Camera whose frame is the rig's frame; default: the first by name."""
     frames: Literal["stem", "order"] = "stem"
     """Which images make one frame: the same file stem, or the same place in sorted order."""
     pairs: Literal["auto", "all", "selected"] = "auto"
     """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
-    """SIFT features an image, at most."""
+    """SIFT features an image, at most: 100 to 50000."""
     video_frames: Annotated[int, Field(ge=3, le=2000)] = 80
-    """Frames picked from a video, at most."""
+    """Frames picked from a video, at most: 3 to 2000."""
     loss: LossName = "cauchy"
     """Robust loss on feature observations."""
     min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
     """Points seen under a smaller angle are left out: they say little and harm the solve."""
+    max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS
+    """Observations in the graph, at most: the longest tracks, spread over the images."""
     principal_point_sigma: Annotated[float, Field(gt=0, le=10)] = 0.03
     """Belief that the principal point is near the image centre: sigma in image widths."""
     aspect_sigma: Annotated[float, Field(gt=0, le=10)] = 0.005
@@ -48,7 +55,7 @@ class Options(BaseModel):
 class CameraConfig(BaseModel):
     """What rig.yaml may say of one camera."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     lens: LensName | None = None
     params: dict[str, float] = {}  # where to start, and the mean of the prior
@@ -56,22 +63,40 @@ class CameraConfig(BaseModel):
     fixed: tuple[str, ...] = ()  # parameters held at their start
     cam_from_rig: CamFromRigConfig | None = None
 
+    @field_validator("params")
+    @classmethod
+    def _focal_lengths_are_positive(cls, params: dict[str, float]) -> dict[str, float]:
+        for name in ("fx", "fy"):
+            if params.get(name, 1.0) <= 0:
+                raise ValueError(f"{name} is {params[name]:g} and must be positive")
+        return params
+
 
 class CamFromRigConfig(BaseModel):
     """A nominal cam_from_rig; with sigmas also a prior."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sigma_rotation_deg: Annotated[float, Field(gt=0)] | None = None
     sigma_translation: Annotated[float, Field(gt=0)] | None = None
 
+    @field_validator("rotation_wxyz")
+    @classmethod
+    def _quaternion_has_length_one(
+        cls, rotation: tuple[float, float, float, float]
+    ) -> tuple[float, float, float, float]:
+        length = math.hypot(*rotation)
+        if abs(length - 1.0) > QUATERNION_TOLERANCE:
+            raise ValueError(f"a rotation has length 1 and this has {length:.3g}")
+        return rotation
+
 
 class BaselineConfig(BaseModel):
     """A measured distance between the optical centres of two cameras."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     cameras: tuple[str, str]
     length_m: Annotated[float, Field(gt=0)]
@@ -79,7 +104,9 @@ class BaselineConfig(BaseModel):
 
 
 class ScaleConfig(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    """What gives the rig's lengths in metres."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     baseline: BaselineConfig | None = None
 
@@ -103,40 +130,60 @@ def load_rig_config(path: Path) -> RigConfig:
 
     Raises CalibrationError naming the key that is wrong and the nearest valid one.
     """
+    misnamed = path.with_suffix(".yml")
+    if misnamed.exists() and not path.exists():
+        raise CalibrationError(f"{misnamed} is not read: call it {path.name}")
     try:
-        content = yaml.safe_load(path.read_text()) if path.exists() else {}
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"cannot read {path}: {error}") from error
-    except yaml.YAMLError as error:
+        content = yaml.safe_load(path.read_text("utf-8")) if path.exists() else {}
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(
+            f"{path} is no text: byte {error.start} is not UTF-8; write it as YAML"
+        ) from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         where = getattr(error, "problem_mark", None)
         line = f" in line {where.line + 1}" if where else ""
         raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
     if content is None:
         content = {}
     if not isinstance(content, dict):
-        raise CalibrationError(f"{path} must hold keys and values, not {type(content).__name__}")
+        raise CalibrationError(
+            f"{path} holds one {type(content).__name__}, not keys and values like 'lens: radtan'"
+        )
     try:
         return RigConfig.model_validate(content)
     except ValidationError as error:
         raise CalibrationError(f"{path}: {first_problem(error)}") from error
 
 
-def error_text(error: yaml.YAMLError) -> str:
-    return str(getattr(error, "problem", None) or error).splitlines()[0]
+def error_text(error: Exception) -> str:
+    """The first line of what a parser says."""
+    return (str(getattr(error, "problem", None) or error).splitlines() or [""])[0]
 
 
-def first_problem(error: ValidationError) -> str:
-    """The first validation error as one line, with the nearest valid name for an unknown key."""
-    problem = error.errors()[0]
-    where = ".".join(str(part) for part in problem["loc"])
+def first_problem(error: ValidationError, spell: Callable[[str], str] = str) -> str:
+    """The first validation error as one line, with the nearest valid name for an unknown key.
+
+    `spell` turns a key into what the user wrote, such as a flag.
+    """
+    problems = error.errors()
+    # A misspelt key is often also a missing one; the misspelling is what to tell.
+    unknown = (problem for problem in problems if problem["type"] == "extra_forbidden")
+    problem = next(unknown, problems[0])
+    where = spell(".".join(str(part) for part in problem["loc"]))
     if problem["type"] == "extra_forbidden":
         names = _valid_names(problem["loc"])
         close = difflib.get_close_matches(str(problem["loc"][-1]), names, n=1, cutoff=0.0)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        return f"unknown key {where!r}{hint} Valid here: {', '.join(names)}"
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        return f"unknown key {where!r}: {hint}Valid here: {', '.join(names)}"
+    if "[key]" in problem["loc"]:
+        key = problem["input"]
+        return f"{where}: the name {key!r} is a {type(key).__name__}; put it in quotes"
     value = problem["input"]
+    message = problem["msg"].removeprefix("Value error, ")
     shown = f" (got {value!r})" if isinstance(value, str | int | float | bool) else ""
-    return f"{where}: {problem['msg']}{shown}"
+    return f"{where}: {message}{shown}"
 
 
 def _valid_names(location: tuple[str | int, ...]) -> list[str]:

@@ -28,7 +28,8 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         os.replace(temporary, path)
     except OSError as error:
         raise CalibrationError(
-            f"cannot write {path}: {error.strerror}; free some space or choose another output folder"
+            f"cannot write {path}: {error.strerror or error}; free some space or choose another "
+            "output folder"
         ) from error
     finally:
         if temporary and os.path.exists(temporary):

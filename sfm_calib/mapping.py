@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from graphs.frames import Transform
+from graphs.join import join_models
 from graphs.lenses import Camera, LensName
 from graphs.problem import Problem
-from graphs.join import join_models
 from graphs.rig_start import FreeModel, impose_rig, link_cameras
 from sfm_calib import colmap
 from sfm_calib.cache import Cache
@@ -18,7 +19,9 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
 from sfm_calib.pairs import choose_pairs
+from sfm_calib.worker import run_apart
 
+DATABASE = "database.db"
 ENOUGH_REGISTERED = 0.9  # of the images; fewer, and mapping starts again elsewhere
 MIN_MATCHES = 15  # COLMAP's own minimum for a verified pair
 
@@ -45,16 +48,24 @@ def map_scan(
     Raises CalibrationError when images do not overlap, or a camera cannot be placed.
     """
     hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
-    inputs = [
-        hashes, scan.cameras, scan.frames, lenses, config.max_features, config.pairs, config.seed,
+    inputs: list[object] = [
+        hashes, scan.cameras, lenses, config.max_features,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
     ]  # fmt: skip
-    tracks = cache.stage(
-        "tracks", inputs, lambda place: _track(scan, config, lenses, known, place, progress)
+    features = cache.stage(
+        "features",
+        inputs,
+        lambda place: run_apart(_extract, (scan, config, lenses, known, place), progress),
     )
-    database = tracks / "database.db"
+    inputs += [scan.frames, config.pairs, config.seed]
+    matches = cache.stage(
+        "matches",
+        inputs,
+        lambda place: run_apart(_match, (scan, config, features, place), progress),
+    )
+    database = matches / DATABASE
     place = cache.stage(
-        "models", inputs, lambda place: _map(scan, config, database, place, progress)
+        "models", inputs, lambda place: run_apart(_map, (scan, config, database, place), progress)
     )
     models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
     reference = scan.cameras.index(config.reference) if config.reference else 0
@@ -63,7 +74,7 @@ def map_scan(
     return Mapped(problem, _messages(scan, model, dropped), hashes)
 
 
-def _track(
+def _extract(
     scan: Scan,
     config: RigConfig,
     lenses: Sequence[LensName],
@@ -71,8 +82,13 @@ def _track(
     place: Path,
     progress: Progress,
 ) -> None:
-    database = place / "database.db"
+    database = place / DATABASE
     colmap.extract_features(scan, lenses, known, database, config.max_features, progress)
+
+
+def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress: Progress) -> None:
+    shutil.copytree(features, place, dirs_exist_ok=True)
+    database = place / DATABASE
     pairs = choose_pairs(
         scan,
         config.pairs,
@@ -123,7 +139,9 @@ def _one_model(
         model = join_models(model, other)
     cam_from_rig, missing = link_cameras(model, reference)
     if missing:
-        raise CalibrationError(_lost_camera(scan, model, missing[0], database))
+        # Where the reference itself was not placed, it is what the others miss.
+        lost = min([reference, *missing], key=lambda camera: len(model.images_of(camera)))
+        raise CalibrationError(_lost_camera(scan, model, lost, database))
     return model, cam_from_rig
 
 

@@ -40,13 +40,14 @@ def lens_of(config: RigConfig, name: str, n_cameras: int) -> LensName:
 
 def check_config(config: RigConfig, scan: Scan) -> None:
     """Raises CalibrationError where rig.yaml names a camera or a parameter that does not exist."""
-    named = [*config.cameras]
-    named += [config.reference] if config.reference else []
-    named += config.scale.baseline.cameras if config.scale.baseline else []
-    for name in named:
+    named = [("cameras", name) for name in config.cameras]
+    named += [("reference", config.reference)] if config.reference else []
+    baseline = config.scale.baseline
+    named += [("scale.baseline.cameras", name) for name in baseline.cameras] if baseline else []
+    for key, name in named:
         if name not in scan.cameras:
             raise CalibrationError(
-                f"rig.yaml names a camera {name!r} that the scan does not have; "
+                f"{key} names a camera {name!r} that the scan does not have; "
                 f"{_nearest(name, scan.cameras)}"
             )
     for name, entry in config.cameras.items():
@@ -58,7 +59,6 @@ def check_config(config: RigConfig, scan: Scan) -> None:
                     f"rig.yaml gives camera {name} a parameter {parameter!r} that its lens "
                     f"{lens} does not have; {_nearest(parameter, valid)}"
                 )
-    baseline = config.scale.baseline
     if baseline and baseline.cameras[0] == baseline.cameras[1]:
         raise CalibrationError(
             f"rig.yaml measures a baseline from {baseline.cameras[0]} to itself; name two cameras"

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from sfm_calib.images import Scan
 
 MAX_COMPARISONS = 2e10  # of descriptors: about a minute on two cores
-# Neighbours in time, of every camera; the wide steps are what fixes the focal length of a
-# forward drive.
-FRAME_STEPS = (0, 1, 2, 3, 4, 5, 6, 8, 12, 16, 24)
-SIMILAR_IMAGES = 15  # neighbours in appearance: loops, unordered photographs
+# Neighbours in time; the wide steps are what fixes the focal length of a forward drive.
+OWN_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # frames, to the same camera
+OTHER_STEPS = (0, 1, 2)  # frames, to other cameras
+SIMILAR_IMAGES = 10  # neighbours in appearance: loops, unordered photographs
 VOCABULARY_SIZE = 64
 DESCRIPTORS_A_IMAGE = 300  # sampled for the vocabulary
 Pair = tuple[int, int]  # indices into Scan.images
@@ -37,15 +37,15 @@ def choose_pairs(
 
 
 def near_in_time(scan: Scan) -> set[Pair]:
-    """Pairs of images FRAME_STEPS frames apart, of the same camera or another."""
-    by_frame: dict[int, list[int]] = {}
-    for number, image in enumerate(scan.images):
-        by_frame.setdefault(image.frame, []).append(number)
+    """Pairs of images of one camera OWN_STEPS frames apart, of two OTHER_STEPS apart."""
+    place = {(image.camera, image.frame): number for number, image in enumerate(scan.images)}
     pairs = set()
-    for frame, members in by_frame.items():
-        for step in FRAME_STEPS:
-            for a in members:
-                pairs |= {(min(a, b), max(a, b)) for b in by_frame.get(frame + step, []) if a != b}
+    for (camera, frame), number in place.items():
+        for other in range(len(scan.cameras)):
+            for step in OWN_STEPS if other == camera else OTHER_STEPS:
+                neighbour = place.get((other, frame + step))
+                if neighbour is not None and neighbour != number:
+                    pairs.add((min(number, neighbour), max(number, neighbour)))
     return pairs
 
 

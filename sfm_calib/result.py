@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, Camera, LensName
@@ -18,6 +18,8 @@ FORMAT: Final = "sfm_calib/1"
 
 
 class Record(BaseModel):
+    """A part of the file: frozen, without unknown keys, without NaN."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
@@ -32,6 +34,13 @@ class CameraResult(Record):
     n_images: int = 0
     n_observations: int = 0
 
+    @model_validator(mode="after")
+    def _params_are_those_of_the_lens(self) -> CameraResult:
+        wanted = PARAMETER_NAMES[self.lens]
+        if set(self.params) != set(wanted):
+            raise ValueError(f"a {self.lens} lens has the parameters {' '.join(wanted)}")
+        return self
+
 
 class CamFromRig(Record):
     """x_cam = rotation x_rig + translation."""
@@ -43,11 +52,15 @@ class CamFromRig(Record):
 
 
 class Scale(Record):
+    """What gives the rig's lengths their unit."""
+
     source: str  # what gave the unit of length
     sigma_relative: float | None = None  # None: no metric scale
 
 
 class RigResult(Record):
+    """How the cameras sit on the rig; the reference's transform is the identity."""
+
     reference: str
     cam_from_rig: dict[str, CamFromRig]
     metric: bool
@@ -64,25 +77,40 @@ class Covariance(Record):
     names: tuple[str, ...] = ()
     matrix: tuple[tuple[float, ...], ...] = ()
 
+    @model_validator(mode="after")
+    def _matrix_is_square(self) -> Covariance:
+        n = len(self.names)
+        if [len(row) for row in self.matrix] != [n] * n:
+            raise ValueError(f"{n} names need a matrix of {n} rows and columns")
+        return self
+
 
 class Noise(Record):
+    """How well the features were located, and how far the stated sigmas exceed the model's."""
+
     sigma_px: float  # robust sigma of one pixel coordinate
     inflation: float = 1.0  # median of stated sigma / model sigma
 
 
 class WeakDirection(Record):
+    """Something that the scan leaves to the priors, and what would determine it."""
+
     what: str
     effect_px: float | None
     remedy: str
 
 
 class Verdict(Record):
+    """Whether to use the result, and what to know before."""
+
     usable: bool
     weak: tuple[WeakDirection, ...] = ()
     messages: tuple[str, ...] = ()
 
 
 class Solve(Record):
+    """How the optimum was reached, and on what."""
+
     converged: bool
     reason: str
     iterations: int
@@ -96,6 +124,8 @@ class Solve(Record):
 
 
 class Provenance(Record):
+    """What made the result: enough to make it again."""
+
     version: str
     versions: dict[str, str] = {}
     command: str = ""
@@ -119,6 +149,14 @@ class Calibration(Record):
     solve: Solve | None = None
     provenance: Provenance = Field(default_factory=lambda: Provenance(version=""))
 
+    @model_validator(mode="after")
+    def _rig_holds_every_camera(self) -> Calibration:
+        if set(self.rig.cam_from_rig) != set(self.cameras):
+            raise ValueError("rig.cam_from_rig and cameras must name the same cameras")
+        if self.rig.reference not in self.cameras:
+            raise ValueError(f"the reference {self.rig.reference!r} is none of the cameras")
+        return self
+
     def camera(self, name: str) -> Camera:
         """The camera as the maths sees it."""
         entry = self.cameras[name]
@@ -126,6 +164,7 @@ class Calibration(Record):
         return Camera(name, entry.lens, entry.size, params)
 
     def cam_from_rig(self, name: str) -> Transform:
+        """How a camera sits on the rig."""
         entry = self.rig.cam_from_rig[name]
         return Transform.from_wxyz(entry.rotation_wxyz, entry.translation)
 
@@ -164,7 +203,8 @@ def load_calibration(path: Path) -> Calibration:
         raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise CalibrationError(f"{path} is no {FORMAT} file: {where}: {first['msg']}") from error
+        where = "".join(f"{part}." for part in first["loc"]).rstrip(".")
+        wrong = f"{where}: {first['msg']}" if where else first["msg"]
+        raise CalibrationError(f"{path} is no {FORMAT} file: {wrong}") from error
     except ValueError as error:
         raise CalibrationError(f"{path} is not JSON: {error}") from error

@@ -1,21 +1,34 @@
-"""What a person sees in the terminal: progress on stderr, the result as a table on stdout."""
+"""What a person sees in the terminal: progress on stderr, the result as tables on stdout."""
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
+from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.images import Progress as Report
 from sfm_calib.report import TruthRow
 from sfm_calib.result import Calibration
 
 SUSPICIOUS_Z = 4.0
+PIPED_WIDTH = 80
+SECONDS_BETWEEN_LINES = 2.0
 
 
 @contextmanager
@@ -26,117 +39,167 @@ def progress_bars() -> Iterator[Report]:
         yield _plain_progress()
         return
     columns = (
-        TextColumn("{task.description:<26}"),
+        TextColumn("{task.description:<26}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as bars:
-        tasks: dict[str, object] = {}
+        tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: int, total: int) -> None:
             for name, task in tasks.items():
                 if name != stage:
-                    bars.stop_task(task)  # type: ignore[arg-type]
+                    bars.stop_task(task)
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total or None)
-            bars.update(tasks[stage], completed=done, total=total or None)  # type: ignore[arg-type]
+            bars.update(tasks[stage], completed=done, total=total or None)
 
         yield report
 
 
 def _plain_progress() -> Report:
-    """One line a stage, and one a tenth of it."""
-    last: dict[str, int] = {}
+    """A line as each stage begins, and one every few seconds."""
+    current, printed = "", 0.0
 
     def report(stage: str, done: int, total: int) -> None:
-        tenth = 10 * done // total if total else 0
-        if last.get(stage) != tenth:
-            last[stage] = tenth
-            share = f" {done} of {total}" if total else ""
-            print(f"{stage}{share}", file=sys.stderr, flush=True)
+        nonlocal current, printed
+        now = time.monotonic()
+        if stage == current and now - printed < SECONDS_BETWEEN_LINES:
+            return
+        current, printed = stage, now
+        how_far = f" {done} of {total}" if total else f" {done}" if done else ""
+        print(f"{stage}{how_far}", file=sys.stderr, flush=True)
 
     return report
+
+
+class ResultConsole(Console):
+    """A console that lets its caller know when nobody reads any more."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+def result_console() -> Console:
+    """Stdout; names are printed as they are, whatever brackets or colons they hold."""
+    width = None if sys.stdout.isatty() else PIPED_WIDTH
+    return ResultConsole(width=width, markup=False, emoji=False, highlight=False)
 
 
 def print_result(calibration: Calibration, console: Console) -> None:
     """The parameters with their sigmas, and what is to be said of them."""
     for name, camera in calibration.cameras.items():
-        table = Table(
-            title=f"{name}  {camera.lens}  {camera.size[0]}x{camera.size[1]}  "
+        _print_line(
+            console,
+            f"{name}: {camera.lens}, {camera.size[0]} x {camera.size[1]} px, "
             f"{camera.n_images} images, {camera.n_observations} observations",
-            title_justify="left",
         )
-        for column in ("", "value", "sigma", "from priors"):
-            table.add_column(column, justify="right" if column else "left")
+        table = _table("", "value", "sigma", "from priors")
         for parameter in PARAMETER_NAMES[camera.lens]:
             value, sigma = camera.params[parameter], camera.sigma.get(parameter, 0.0)
             share = camera.prior_share.get(parameter, 0.0)
-            table.add_row(parameter, _number(value, sigma), _sigma(sigma), f"{share:.0%}")
+            table.add_row(parameter, with_digits(value, sigma), sigma_text(sigma), f"{share:.0%}")
         console.print(table)
     if len(calibration.cameras) > 1:
-        console.print(_rig_table(calibration))
+        _print_rig(calibration, console)
     solve, noise, verdict = calibration.solve, calibration.noise, calibration.verdict
     if solve and noise:
-        console.print(
+        _print_line(
+            console,
             f"{solve.n_images} images in {solve.n_frames} frames, {solve.n_points} points, "
-            f"{solve.n_observations} observations ({solve.n_rejected} mismatches set aside); "
-            f"noise {noise.sigma_px:.2f} px, sigmas widened {noise.inflation:.1f} x"
+            f"{solve.n_observations} observations",
+        )
+        _print_line(
+            console,
+            f"{solve.n_rejected} mismatches set aside; noise {noise.sigma_px:.2f} px, "
+            f"sigmas widened {noise.inflation:.1f} x",
         )
     for weak in verdict.weak if verdict else ():
-        console.print(f"weak: {weak.what} is decided by its prior; {weak.remedy}")
+        _print_line(console, f"weak: {weak.what} is decided by its prior; {weak.remedy}")
     for message in verdict.messages if verdict else ():
-        console.print(f"note: {message}")
+        _print_line(console, f"note: {message}")
+    if verdict and not verdict.usable:
+        _print_line(console, "NOT USABLE: see the notes above")
 
 
-def _rig_table(calibration: Calibration) -> Table:
-    unit = "m" if calibration.rig.metric else "baselines"
-    table = Table(
-        title=f"cam_from_rig  reference {calibration.rig.reference}  scale {calibration.rig.scale.source}",
-        title_justify="left",
-    )
-    for column in ("", "rotation (wxyz)", "sigma deg", f"translation {unit}", "sigma"):
-        table.add_column(column)
-    for name, entry in calibration.rig.cam_from_rig.items():
-        table.add_row(
-            name,
-            " ".join(f"{q:+.5f}" for q in entry.rotation_wxyz),
-            " ".join(f"{s:.2g}" for s in entry.sigma_rotation_deg),
-            " ".join(f"{t:+.4f}" for t in entry.translation),
-            " ".join(f"{s:.2g}" for s in entry.sigma_translation),
-        )
+def _print_line(console: Console, text: str) -> None:
+    """A line that a terminal breaks between words, and a file holds whole."""
+    console.print(text, soft_wrap=not console.is_terminal)
+
+
+def _table(*columns: str) -> Table:
+    table = Table()
+    for column in columns:
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
     return table
+
+
+def _print_rig(calibration: Calibration, console: Console) -> None:
+    """cam_from_rig of every camera but the reference, an axis a row."""
+    rig = calibration.rig
+    _print_line(console, f"cam_from_rig: reference {rig.reference}, scale {rig.scale.source}")
+    table = _table(
+        "",
+        "",
+        "rotation deg",
+        "sigma",
+        f"translation {'m' if rig.metric else 'baselines'}",
+        "sigma",
+    )
+    for name, entry in rig.cam_from_rig.items():
+        if name == rig.reference:
+            continue
+        turn = np.degrees(log_rotation(calibration.cam_from_rig(name).rotation))
+        for axis, letter in enumerate("xyz"):
+            turned, moved = entry.sigma_rotation_deg[axis], entry.sigma_translation[axis]
+            table.add_row(
+                name if axis == 0 else "",
+                letter,
+                with_digits(float(turn[axis]), turned),
+                sigma_text(turned),
+                with_digits(entry.translation[axis], moved),
+                sigma_text(moved),
+                end_section=axis == 2,
+            )
+    console.print(table)
 
 
 def print_comparison(rows: Sequence[TruthRow], console: Console) -> None:
     """Estimate, truth, error, sigma and z of each parameter."""
-    table = Table(title="against the truth", title_justify="left")
-    for column in ("", "estimate", "truth", "error", "sigma", "z"):
-        table.add_column(column, justify="right" if column else "left")
+    _print_line(console, "against the truth")
+    table = _table("", "estimate", "truth", "error", "sigma", "z")
     for row in rows:
-        z = f"{row.z:+.1f}" if row.z == row.z else "-"
-        style = "bold red" if abs(row.z) > SUSPICIOUS_Z else ""
         table.add_row(
             row.name,
-            _number(row.estimate, row.sigma),
-            _number(row.truth, row.sigma),
-            f"{row.error:+.2g}",
-            _sigma(row.sigma),
-            z,
-            style=style,
+            with_digits(row.estimate, row.sigma),
+            with_digits(row.truth, row.sigma),
+            with_digits(row.error, row.sigma, "+"),
+            sigma_text(row.sigma),
+            f"{row.z:+.1f}" if math.isfinite(row.z) else "-",
+            style="bold red" if abs(row.z) > SUSPICIOUS_Z else "",
         )
     console.print(table)
 
 
-def _number(value: float, sigma: float) -> str:
-    """As many digits as the sigma makes meaningful."""
-    if sigma <= 0:
-        return f"{value:.6g}"
-    digits = 0
-    while digits < 9 and sigma * 10**digits < 2:
-        digits += 1
-    return f"{value:.{digits}f}"
+def with_digits(value: float, sigma: float, sign: str = "") -> str:
+    """A value to the second digit of its sigma, which is as far as it means something."""
+    decimals = _decimals(sigma)
+    if decimals is None:
+        return f"{value:{sign}.6g}"
+    text = f"{value:{sign}.{decimals}f}"
+    return text if float(text) or value >= 0 else text.replace("-", "+" if sign else "", 1)
 
 
-def _sigma(sigma: float) -> str:
-    return f"{sigma:.2g}" if sigma > 0 else "fixed"
+def sigma_text(sigma: float) -> str:
+    """A sigma to two digits, aligned with its value."""
+    decimals = _decimals(sigma)
+    return "fixed" if decimals is None else f"{sigma:.{decimals}f}"
+
+
+def _decimals(sigma: float) -> int | None:
+    """Decimals that show two digits of a sigma, or None where there is no sigma."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return None
+    exponent = int(f"{sigma:.1e}".split("e")[1])  # after rounding: 0.0996 is 1.0e-01
+    return max(0, 1 - exponent)

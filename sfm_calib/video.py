@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,14 +17,39 @@ SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 ANALYSIS_WIDTH = 320  # px; motion and sharpness need no more
 # A tenth of the width between picked frames keeps nine tenths in common for matching.
 MOTION_STEP = 0.08  # of the image width
+LEAST_MOTION = 3 * MOTION_STEP  # three views are the fewest that determine a focal length
 GrayImage = NDArray[np.uint8]
 
 
 def find_videos(scan: Path) -> dict[str, Path]:
-    """Video files by camera name (their stem): the file itself, or every video in the folder."""
+    """Video files by camera name: the file itself, or every video in the folder by its stem, or
+    the one video in each sub-folder by the folder's name.
+
+    Raises CalibrationError when two would have the same name.
+    """
     if scan.is_file():
         return {scan.stem: scan} if scan.suffix.lower() in SUFFIXES else {}
-    return {p.stem: p for p in sorted(scan.iterdir()) if p.suffix.lower() in SUFFIXES}
+    named = [(path.stem, path) for path in _videos_in(scan)]
+    if not named:
+        folders = sorted(p for p in scan.iterdir() if p.is_dir() and not p.name.startswith("."))
+        named = [(folder.name, path) for folder in folders for path in _videos_in(folder)]
+    videos: dict[str, Path] = {}
+    for name, path in named:
+        if name in videos:
+            raise CalibrationError(
+                f"{videos[name].name} and {path.name} would both be the camera {name}: rename or "
+                "remove one"
+            )
+        videos[name] = path
+    return videos
+
+
+def _videos_in(folder: Path) -> list[Path]:
+    return sorted(
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")
+    )
 
 
 def unpack(
@@ -34,11 +61,17 @@ def unpack(
     """Write the picked frames as OUT/<camera>/<frame number>.png, or OUT/... of a lone video.
 
     Videos of one folder are taken as started together: the same frame numbers of each are used.
-    Raises CalibrationError when a video cannot be decoded.
+    Raises CalibrationError when a video cannot be decoded, or nothing moves in it.
     """
     tracks = {name: _analyse(path, progress) for name, path in videos.items()}
     length = min(len(motion) for motion, _ in tracks.values())
     motion = np.max([motion[:length] for motion, _ in tracks.values()], axis=0)
+    if motion.sum() < LEAST_MOTION:
+        raise CalibrationError(
+            f"{', '.join(path.name for path in videos.values())}: the view moves by "
+            f"{motion.sum():.1%} of the image width in {length} frames (needs {LEAST_MOTION:.0%}); "
+            "a calibration needs views from different places: move the camera while it films"
+        )
     sharpness = np.min([_ranks(sharp[:length]) for _, sharp in tracks.values()], axis=0)
     picked = pick_frames(motion, sharpness, max_frames)
     for name, path in videos.items():
@@ -121,5 +154,5 @@ def _write_frames(
         if number not in picked:
             continue
         if not cv2.imwrite(str(folder / f"{number:06d}.png"), frame):
-            raise CalibrationError(f"cannot write frames to {folder}: is the disk full?")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # OpenCV does not say why
     capture.release()

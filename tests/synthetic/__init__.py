@@ -1,0 +1,1 @@
+"""Scenes that tests make for themselves."""

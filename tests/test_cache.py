@@ -1,0 +1,144 @@
+"""Stages that need not run twice, and whole files or none."""
+
+import errno
+import os
+
+import pytest
+
+from sfm_calib import cache as cache_module
+from sfm_calib import files
+from sfm_calib.cache import Cache
+from sfm_calib.errors import CalibrationError
+from sfm_calib.files import sha256, write_atomically
+
+
+class Stage:
+    """A stage that counts how often it runs."""
+
+    def __init__(self):
+        self.runs = 0
+
+    def __call__(self, place):
+        self.runs += 1
+        (place / "result").write_text(f"run {self.runs}")
+
+
+@pytest.fixture
+def make():
+    return Stage()
+
+
+def test_a_finished_stage_is_reused(tmp_path, make):
+    first = Cache(tmp_path).stage("a", {"x": 1}, make)
+    again = Cache(tmp_path).stage("a", {"x": 1}, make)
+    assert make.runs == 1 and first == again and (again / "result").read_text() == "run 1"
+
+
+@pytest.mark.parametrize("inputs", [{"x": 2}, {"y": 1}, {"x": 1, "y": 1}, {"x": "1"}, {"x": [1]}])
+def test_other_inputs_make_it_again(tmp_path, make, inputs):
+    Cache(tmp_path).stage("a", {"x": 1}, make)
+    place = Cache(tmp_path).stage("a", inputs, make)
+    assert make.runs == 2 and (place / "result").read_text() == "run 2"
+
+
+def test_stages_are_apart(tmp_path, make):
+    Cache(tmp_path).stage("a", 1, make)
+    Cache(tmp_path).stage("b", 2, make)
+    Cache(tmp_path).stage("a", 1, make)
+    assert make.runs == 2
+
+
+def test_fresh_ignores_what_was_left(tmp_path, make):
+    Cache(tmp_path).stage("a", 1, make)
+    Cache(tmp_path, fresh=True).stage("a", 1, make)
+    assert make.runs == 2
+    Cache(tmp_path).stage("a", 1, make)
+    assert make.runs == 2
+
+
+def test_a_stage_that_was_killed_is_made_again_from_nothing(tmp_path, make):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "half").write_text("")
+    place = Cache(tmp_path).stage("a", 1, make)
+    assert make.runs == 1 and [path.name for path in place.iterdir()] == ["result"]
+
+
+@pytest.mark.parametrize("damage", ["folder", "key", "binary key"])
+def test_a_damaged_cache_is_made_again(tmp_path, make, damage):
+    place = Cache(tmp_path).stage("a", 1, make)
+    if damage == "folder":
+        (place / "result").unlink()
+        place.rmdir()
+    else:
+        (tmp_path / "a.key").write_bytes(b"\xff\xfe" if "binary" in damage else b"")
+    Cache(tmp_path).stage("a", 1, make)
+    assert make.runs == 2
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, CalibrationError, RuntimeError])
+def test_a_stage_that_fails_leaves_nothing_that_looks_done(tmp_path, make, error):
+    def fail(place):
+        (place / "half").write_text("")
+        raise error
+
+    Cache(tmp_path / "cache").stage("a", 1, make)
+    with pytest.raises(error):
+        Cache(tmp_path / "cache").stage("a", 2, fail)
+    assert not (tmp_path / "cache").exists()  # nothing is left to keep it for
+
+
+def test_a_full_disk_is_said_and_freed(tmp_path):
+    def fail(place):
+        (place / "half").write_text("")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(CalibrationError, match=r"cannot write .*/a: No space left .*; free some"):
+        Cache(tmp_path).stage("a", 1, fail)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_full_disk_that_a_library_hides(tmp_path, monkeypatch):
+    def fail(place):
+        raise RuntimeError("No registered database factory succeeded.")
+
+    with pytest.raises(RuntimeError):
+        Cache(tmp_path).stage("a", 1, fail)
+    monkeypatch.setattr(cache_module, "DISK_IS_FULL", 1 << 62)
+    with pytest.raises(CalibrationError, match="MB are free"):
+        Cache(tmp_path).stage("a", 1, fail)
+
+
+# ---- files -------------------------------------------------------------------------------------
+
+
+def test_a_file_is_written_whole(tmp_path):
+    write_atomically(tmp_path / "new" / "a.json", "Käm")
+    write_atomically(tmp_path / "new" / "a.json", b"other")
+    assert (tmp_path / "new" / "a.json").read_bytes() == b"other"
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.json"]
+    assert (tmp_path / "new" / "a.json").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("where", ["fsync", "replace"])
+def test_the_old_file_survives_a_failure(tmp_path, monkeypatch, where):
+    write_atomically(tmp_path / "a", "old")
+
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os, where, fail)
+    with pytest.raises(CalibrationError, match="No space left on device; free some space"):
+        write_atomically(tmp_path / "a", "new")
+    monkeypatch.undo()
+    assert (tmp_path / "a").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_path_under_a_file(tmp_path):
+    (tmp_path / "a").write_text("")
+    with pytest.raises(CalibrationError, match="cannot write"):
+        write_atomically(tmp_path / "a" / "b", "new")
+
+
+def test_sha256(tmp_path):
+    (tmp_path / "a").write_bytes(b"")
+    assert sha256(tmp_path / "a").startswith("e3b0c44298fc1c149afbf4c8996fb924")

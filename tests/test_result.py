@@ -1,0 +1,85 @@
+"""calibration.json: written whole, read strictly."""
+
+import json
+
+import numpy as np
+import pytest
+
+from graphs.frames import Transform
+from graphs.lenses import Camera
+from sfm_calib.errors import CalibrationError
+from sfm_calib.result import Calibration, load_calibration, save_calibration, truth
+
+
+def rig(names=("left", "right")):
+    params = np.array([500.0, 501.0, 320.0, 240.0, -0.1, 0.01, 0.0, 0.0])
+    cameras = [Camera(name, "radtan", (640, 480), params) for name in names]
+    turns = [[1.0, 0.0, 0.0, 0.0], [np.cos(0.1), 0.0, np.sin(0.1), 0.0]][: len(names)]
+    moves = [[0.0, 0.0, 0.0], [-0.2, 0.0, 0.01]][: len(names)]
+    transforms = [Transform.from_wxyz(q, t) for q, t in zip(turns, moves, strict=True)]
+    return truth(cameras, transforms, "0.0")
+
+
+def test_what_is_saved_is_read_again(tmp_path):
+    save_calibration(rig(), tmp_path / "new" / "calibration.json")
+    read = load_calibration(tmp_path / "new" / "calibration.json")
+    assert read == rig() and read.camera("right").named()["k1"] == -0.1
+    expected = Transform.from_wxyz([np.cos(0.1), 0.0, np.sin(0.1), 0.0], [-0.2, 0.0, 0.01])
+    np.testing.assert_allclose(read.cam_from_rig("right").rotation, expected.rotation)
+    assert (
+        json.loads((tmp_path / "new" / "calibration.json").read_text())["format"] == "sfm_calib/1"
+    )
+
+
+def set_in(content, path, value):
+    *parents, last = path.split(".")
+    for key in parents:
+        content = content[key]
+    if value is None:
+        del content[last]
+    else:
+        content[last] = value
+
+
+WRONG = {
+    "another format": ("format", "sfm_calib/2", "format: "),
+    "no cameras": ("cameras", None, "cameras: Field required"),
+    "an unknown key": ("rig.colour", "red", "rig.colour: Extra inputs are not permitted"),
+    "an unknown lens": ("cameras.left.lens", "magic", "cameras.left.lens: "),
+    "a missing parameter": ("cameras.left.params.k2", None, "a radtan lens has the parameters fx"),
+    "a parameter too many": ("cameras.left.params.k9", 0.0, "a radtan lens has the parameters fx"),
+    "a word for a number": ("cameras.left.params.fx", "long", "cameras.left.params.fx: "),
+    "an unknown reference": ("rig.reference", "top", "'top' is none of the cameras"),
+    "a camera off the rig": ("rig.cam_from_rig.right", None, "must name the same cameras"),
+    "a covariance of another size": ("covariance.names", ["left.fx"], "1 names need a matrix of 1"),
+}
+
+
+@pytest.mark.parametrize(("key", "value", "message"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_named(tmp_path, key, value, message):
+    content = json.loads(rig().model_dump_json())
+    set_in(content, key, value)
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(tmp_path / "c.json")
+    assert message in str(caught.value) and "is no sfm_calib/1 file" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null"])
+def test_files_of_another_kind(tmp_path, content):
+    (tmp_path / "c.json").write_bytes(content)
+    with pytest.raises(CalibrationError, match=r"is not JSON|is no sfm_calib/1 file"):
+        load_calibration(tmp_path / "c.json")
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(CalibrationError, match=r"cannot read .*: No such file"):
+        load_calibration(tmp_path / "c.json")
+
+
+def test_what_is_not_a_number_is_not_written():
+    with pytest.raises(ValueError, match="finite number"):
+        Calibration.model_validate(
+            rig().model_dump() | {"noise": {"sigma_px": float("nan"), "inflation": 1.0}}
+        )
