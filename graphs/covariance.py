@@ -48,7 +48,8 @@ class Covariance:
     def of_difference(self, a: str, b: str) -> float:
         """Sigma of parameter `a` minus parameter `b`; one that is not here has none."""
         weights = np.array([(name == a) - (name == b) for name in self.names], dtype=np.float64)
-        return float(np.sqrt(max(weights @ self.matrix @ weights, 0.0)))
+        variance = float(weights @ self.matrix @ weights)
+        return max(variance, 0.0) ** 0.5
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,7 @@ def check_config(config: RigConfig, scan: Scan) -> None:
     for key, name in named:
         if name not in scan.cameras:
             raise CalibrationError(
-                f"{key} names a camera {name!r} that the scan does not have; "
-                f"{_nearest(name, scan.cameras)}"
+                f"{key}: the scan has no camera {name!r}; {_nearest(name, scan.cameras)}"
             )
     for name, entry in config.cameras.items():
         lens = lens_of(config, name, len(scan.cameras))

@@ -119,11 +119,11 @@ def scan(tmp_path_factory):
 
 
 UNKNOWN = {
-    "camera": ({"cameras": {"letf": {}}}, "a camera 'letf' that the scan does not have; did you"),
-    "reference": ({"reference": "rihgt"}, "reference names a camera 'rihgt'"),
+    "camera": ({"cameras": {"letf": {}}}, "has no camera 'letf'; did you mean 'left'?"),
+    "reference": ({"reference": "rihgt"}, "reference: the scan has no camera 'rihgt'"),
     "baseline": (
         {"scale": {"baseline": {"cameras": ["left", "top"], "length_m": 1, "sigma_m": 1}}},
-        "'top' that the scan does not have; it has left, right",
+        "scale.baseline.cameras: the scan has no camera 'top'; it has left, right",
     ),
     "parameter": ({"cameras": {"left": {"params": {"k9": 1}}}}, "a parameter 'k9'"),
     "baseline to itself": (

@@ -68,6 +68,14 @@ def test_loops_are_found_by_appearance(seed):
     assert not any((place, place + 30) in near_in_time(scan_of(1, 60)) for place in range(30))
 
 
+def test_a_large_scan_is_matched_with_its_loops():
+    places = [*range(30), *range(30)]
+    chosen = choose_pairs(scan_of(1, 60), "selected", descriptors_of(places), 0)
+    assert {(place, place + 30) for place in range(30)} | near_in_time(scan_of(1, 60)) <= set(
+        chosen
+    )
+
+
 def test_the_choice_is_the_same_every_time():
     descriptors = descriptors_of(list(range(40)))
     assert similar(40, descriptors, 5) == similar(40, descriptors, 5)
