@@ -187,15 +187,19 @@ def clustered_variance(scores: FloatArray, rhs: FloatArray, seen: Observations) 
     By frame plus by track less what both count, and never less than either alone.
     """
     moved = (scores * rhs[:, None]).reshape(len(seen), 2, -1).sum(1)
-    by_frame, by_track = _sum_of_squares(moved, seen.frame), _sum_of_squares(moved, seen.point)
-    return np.maximum(by_frame + by_track - (moved**2).sum(0), np.maximum(by_frame, by_track))
+    both = seen.frame * (int(seen.point.max()) + 1) + seen.point  # cameras of a frame see it too
+    by_frame, by_track, by_both = (
+        _sum_of_squares(moved, np.unique(cluster, return_inverse=True)[1])
+        for cluster in (seen.frame, seen.point, both)
+    )
+    return np.maximum(by_frame + by_track - by_both, np.maximum(by_frame, by_track))
 
 
 def _sum_of_squares(moved: FloatArray, cluster: IntArray) -> FloatArray:
     """Sum over clusters of the square of what each cluster's errors do together (n,)."""
-    together = np.zeros((int(cluster.max()) + 1, moved.shape[1]))
+    n_clusters = int(cluster.max()) + 1
+    together = np.zeros((n_clusters, moved.shape[1]))
     np.add.at(together, cluster, moved)
-    n_clusters = len(np.unique(cluster))
     return (together**2).sum(0) * (n_clusters / max(n_clusters - 1, 1))
 
 

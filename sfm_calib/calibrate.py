@@ -85,7 +85,7 @@ def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Re
     options = GraphOptions(
         loss=config.loss,
         lens_priors=lens_priors(problem.initial, config),
-        rig_priors=rig_priors(problem.initial, config),
+        rig_priors=rig_priors(problem.initial, config, problem.reference),
     )
     try:
         return refine(

@@ -9,11 +9,10 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -28,6 +27,7 @@ from sfm_calib.images import Progress, Scan
 from sfm_calib.pairs import Pair
 
 VERSION = pycolmap.__version__
+Model = pycolmap.Reconstruction
 PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
@@ -65,28 +65,13 @@ def is_verbose() -> bool:
     return bool(pycolmap.logging.minloglevel == 0)
 
 
-def _cancellable(work: Callable[[Any], Any]) -> Any:
-    """Run `work(token)` in a thread, so that Ctrl-C reaches us and then COLMAP."""
-    token, outcome = pycolmap.CancellationToken(), {}
-
-    def run() -> None:
-        try:
-            outcome["value"] = work(token)
-        except BaseException as error:
-            outcome["error"] = error
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
+@contextmanager
+def _colmap_errors() -> Iterator[None]:
+    """COLMAP's exceptions as ours; what aborts it instead is the worker's to tell."""
     try:
-        while thread.is_alive():
-            thread.join(0.1)
-    except KeyboardInterrupt:
-        token.cancel()
-        thread.join(30)
-        raise
-    if "error" in outcome:
-        raise CalibrationError(f"COLMAP failed: {str(outcome['error']).splitlines()[-1]}")
-    return outcome["value"]
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise CalibrationError(f"COLMAP failed: {str(error).splitlines()[-1]}") from error
 
 
 def colmap_camera(camera: Camera, model: str, camera_id: int = 1) -> pycolmap.Camera:
@@ -143,27 +128,29 @@ def extract_features(
         paths = [image.path for image in scan.images if image.camera == index]
         for begin in range(0, len(paths), IMAGES_A_BATCH):
             batch = paths[begin : begin + IMAGES_A_BATCH]
-            _cancellable(
-                lambda token, batch=batch, reader=reader: pycolmap.extract_features(
+            with _colmap_errors():
+                pycolmap.extract_features(
                     database, scan.root, batch, pycolmap.CameraMode.SINGLE, reader, options,
-                    pycolmap.Device.cpu, token,
-                )
-            )  # fmt: skip
+                    pycolmap.Device.cpu,
+                )  # fmt: skip
             if begin == 0:
-                reader.existing_camera_id = _camera_ids(database, batch[:1])[0]
+                reader.existing_camera_id = _read_image(database, batch[0]).camera_id
             progress("extracting features", done := done + len(batch), len(scan.images))
 
 
-def _camera_ids(database: Path, paths: Sequence[str]) -> list[int]:
+def _read_image(database: Path, path: str) -> pycolmap.Image:
     with pycolmap.Database.open(database) as db:
-        images = [db.read_image_with_name(path) for path in paths]
-    return [image.camera_id for image in images]
+        image = db.read_image_with_name(path)
+    if image is None:
+        raise CalibrationError(f"COLMAP could not read {path}: convert it to PNG or JPEG")
+    return image
 
 
 def read_descriptors(database: Path, path: str) -> NDArray[np.uint8]:
     """SIFT descriptors (n, 128) of one image."""
+    image_id = _read_image(database, path).image_id
     with pycolmap.Database.open(database) as db:
-        return np.asarray(db.read_descriptors(db.read_image_with_name(path).image_id).data)
+        return np.asarray(db.read_descriptors(image_id).data)
 
 
 def match_features(
@@ -183,11 +170,10 @@ def match_features(
     for begin in range(0, len(pairs), PAIRS_A_BATCH):
         batch = pairs[begin : begin + PAIRS_A_BATCH]
         listing.write_text("".join(f"{a} {b}\n" for a, b in batch))
-        _cancellable(
-            lambda token: pycolmap.match_image_pairs(
-                database, options, pairing, verification, pycolmap.Device.cpu, token
+        with _colmap_errors():
+            pycolmap.match_image_pairs(
+                database, options, pairing, verification, pycolmap.Device.cpu
             )
-        )
         progress("matching", begin + len(batch), len(pairs))
     _rename_images(database, {number: path for path, number in numbers.items()})
 
@@ -213,8 +199,40 @@ def match_counts(scan: Scan, database: Path) -> dict[Pair, int]:
     return counted
 
 
+def constrain_rig(
+    scan: Scan, cam_from_rig: Sequence[Transform], reference: int, database: Path
+) -> None:
+    """Tell a database how its cameras sit, so that mapping places whole frames.
+
+    COLMAP groups images by what follows their camera's folder: `can_constrain` says whether
+    that is how this scan's frames are named.
+    """
+    rig = pycolmap.RigConfig()
+    cameras = []
+    for index, transform in enumerate(cam_from_rig):
+        camera = pycolmap.RigConfigCamera()
+        first = next(image for image in scan.images if image.camera == index)
+        camera.image_prefix = f"{Path(first.path).parent.as_posix()}/"
+        camera.ref_sensor = index == reference
+        if index != reference:
+            rotation = pycolmap.Rotation3d(transform.rotation)
+            camera.cam_from_rig = pycolmap.Rigid3d(rotation, transform.translation)
+        cameras.append(camera)
+    rig.cameras = cameras
+    with pycolmap.Database.open(database) as db:
+        pycolmap.apply_rig_config([rig], db)
+
+
+def can_constrain(scan: Scan) -> bool:
+    """Whether images of one frame have the same file name in every camera's folder."""
+    names: dict[int, set[str]] = {}
+    for image in scan.images:
+        names.setdefault(image.frame, set()).add(Path(image.path).name)
+    return len(scan.cameras) > 1 and all(len(of_frame) == 1 for of_frame in names.values())
+
+
 def worth(models: Sequence[pycolmap.Reconstruction], scan: Scan) -> tuple[int, int, int]:
-    """What a mapping explains: cameras placed in any model, images and points of the largest.
+    """What a mapping explains: cameras placed in any model, images and observations of the largest.
 
     Cameras first: models of different cameras can be joined through the rig's motion.
     """
@@ -223,7 +241,7 @@ def worth(models: Sequence[pycolmap.Reconstruction], scan: Scan) -> tuple[int, i
     owner = {image.path: image.camera for image in scan.images}
     names = {m.images[i].name for m in models for i in m.reg_image_ids()}
     cameras = {owner[name] for name in names}
-    return len(cameras), models[0].num_reg_images(), models[0].num_points3D()
+    return len(cameras), models[0].num_reg_images(), models[0].compute_num_observations()
 
 
 def write_models(models: Sequence[pycolmap.Reconstruction], place: Path) -> None:
@@ -299,12 +317,11 @@ def map_images(
         registered = min(registered + 1, len(scan.images))
         progress("mapping", registered, len(scan.images))
 
-    models = _cancellable(
-        lambda token: pycolmap.incremental_mapping(
+    with _colmap_errors():
+        models = pycolmap.incremental_mapping(
             database, scan.root, out, options,
-            initial_image_pair_callback=count, next_image_callback=count, cancellation_token=token,
-        )
-    )  # fmt: skip
+            initial_image_pair_callback=count, next_image_callback=count,
+        )  # fmt: skip
     return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
@@ -317,14 +334,15 @@ def free_model(
     cameras: dict[int, Camera] = {}
     poses = {}
     for image in images.values():
-        here = place[image.name]
+        here, found = place[image.name], image.camera
+        assert found is not None  # a registered image has one
         pose = image.cam_from_world()
         poses[here.camera, here.frame] = Transform(
             pose.rotation.matrix(), np.ravel(pose.translation)
         )
         cameras.setdefault(
             here.camera,
-            camera_from_colmap(scan.cameras[here.camera], lenses[here.camera], image.camera),
+            camera_from_colmap(scan.cameras[here.camera], lenses[here.camera], found),
         )
     keypoints = {i: np.array([p.xy for p in image.points2D]) for i, image in images.items()}
     pixels, frames, owners, points, positions = [], [], [], [], []

@@ -60,7 +60,7 @@ class CameraConfig(BaseModel):
     lens: LensName | None = None
     params: dict[str, float] = {}  # where to start, and the mean of the prior
     sigma: dict[str, Annotated[float, Field(gt=0)]] = {}  # sigma of the prior on params
-    fixed: tuple[str, ...] = ()  # parameters held at their start
+    fixed: tuple[str, ...] = ()  # held at params, else at 0 and the image centre
     cam_from_rig: CamFromRigConfig | None = None
 
     @field_validator("params")
@@ -73,7 +73,7 @@ class CameraConfig(BaseModel):
 
 
 class CamFromRigConfig(BaseModel):
-    """A nominal cam_from_rig; with sigmas also a prior."""
+    """A nominal cam_from_rig: mapping is also tried with it imposed; with sigmas also a prior."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

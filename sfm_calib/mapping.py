@@ -18,6 +18,7 @@ from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
+from sfm_calib.nominal import nominal_rig
 from sfm_calib.pairs import choose_pairs
 from sfm_calib.worker import run_apart
 
@@ -63,12 +64,18 @@ def map_scan(
         inputs,
         lambda place: run_apart(_match, (scan, config, features, place), progress),
     )
-    database = matches / DATABASE
+    database, reference = matches / DATABASE, reference_of(scan, config)
+    nominal = nominal_rig(config, scan.cameras, reference)
+    inputs += [
+        [[*t.rotation.ravel().tolist(), *t.translation.tolist()] for t in nominal or ()],
+        reference if nominal else None,
+    ]
     place = cache.stage(
-        "models", inputs, lambda place: run_apart(_map, (scan, config, database, place), progress)
+        "models",
+        inputs,
+        lambda place: run_apart(_map, (scan, config, nominal, database, place), progress),
     )
     models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
-    reference = scan.cameras.index(config.reference) if config.reference else 0
     model, cam_from_rig = _one_model(scan, models, reference, database)
     problem, dropped = impose_rig(model, cam_from_rig, scan.frames, reference)
     return Mapped(problem, _messages(scan, model, dropped), hashes)
@@ -105,23 +112,48 @@ def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress:
         )
 
 
-def _map(scan: Scan, config: RigConfig, database: Path, place: Path, progress: Progress) -> None:
-    """Map from several starts until most images are registered; keep the best start."""
-    best: tuple[int, int, int] | None = None
+def _map(
+    scan: Scan,
+    config: RigConfig,
+    nominal: tuple[Transform, ...] | None,
+    database: Path,
+    place: Path,
+    progress: Progress,
+) -> None:
+    """Map freely, from several starts until most images are registered, and with the nominal rig
+    imposed where one is given; keep what explains most."""
+    best = (0, 0, 0)
     for number, attempt in enumerate(colmap.attempts(config.seed)):
-        trial = place / f"attempt{number}"
-        models = colmap.map_images(scan, database, trial, attempt, progress)
-        score = colmap.worth(models, scan)
-        if best is None or score > best:
-            best = score
-            colmap.write_models(models, place / "best")
-        if score[1] >= ENOUGH_REGISTERED * len(scan.images):
+        models = colmap.map_images(scan, database, place / f"free{number}", attempt, progress)
+        best = _keep_better(models, scan, place, best)
+        if best[1] >= ENOUGH_REGISTERED * len(scan.images):
             break
-    if best is None or best[1] == 0:
+    if nominal is not None and colmap.can_constrain(scan):
+        constrained = place / "rig.db"
+        shutil.copyfile(database, constrained)
+        colmap.constrain_rig(scan, nominal, reference_of(scan, config), constrained)
+        attempt = colmap.attempts(config.seed)[0]
+        models = colmap.map_images(scan, constrained, place / "rig", attempt, progress)
+        best = _keep_better(models, scan, place, best)
+    if best[1] == 0:
         raise CalibrationError(
             f"none of {len(scan.images)} images could be placed in {number + 1} attempts: "
             f"{_overlap_in_words(scan, database)}; move the camera sideways between views"
         )
+
+
+def _keep_better(
+    models: list[colmap.Model], scan: Scan, place: Path, best: tuple[int, int, int]
+) -> tuple[int, int, int]:
+    score = colmap.worth(models, scan)
+    if score > best:
+        colmap.write_models(models, place / "best")
+    return max(score, best)
+
+
+def reference_of(scan: Scan, config: RigConfig) -> int:
+    """Index of the camera whose frame is the rig's."""
+    return scan.cameras.index(config.reference) if config.reference else 0
 
 
 def _overlap_in_words(scan: Scan, database: Path) -> str:

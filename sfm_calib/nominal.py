@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,6 +59,17 @@ def check_config(config: RigConfig, scan: Scan) -> None:
                     f"rig.yaml gives camera {name} a parameter {parameter!r} that its lens "
                     f"{lens} does not have; {_nearest(parameter, valid)}"
                 )
+        for parameter in entry.sigma:
+            if parameter not in entry.params:
+                raise CalibrationError(
+                    f"rig.yaml gives camera {name} a sigma of {parameter} without its value: "
+                    f"add cameras.{name}.params.{parameter}"
+                )
+        for parameter in {"fx", "fy"} & set(entry.fixed) - set(entry.params):
+            raise CalibrationError(
+                f"rig.yaml holds {parameter} of camera {name} without its value: add "
+                f"cameras.{name}.params.{parameter}"
+            )
     if baseline and baseline.cameras[0] == baseline.cameras[1]:
         raise CalibrationError(
             f"rig.yaml measures a baseline from {baseline.cameras[0]} to itself; name two cameras"
@@ -100,28 +112,51 @@ def lens_priors(start: Estimate, config: RigConfig) -> tuple[LensPrior, ...]:
     return tuple(priors)
 
 
-def nominal_transform(said: CamFromRigConfig) -> Transform:
-    """cam_from_rig as rig.yaml gives it."""
-    return Transform.from_wxyz(said.rotation_wxyz, said.translation)
+def nominal_rig(
+    config: RigConfig, names: Sequence[str], reference: int
+) -> tuple[Transform, ...] | None:
+    """cam_from_rig of every camera as rig.yaml gives it, the reference's frame as the rig's.
+
+    None unless it gives every camera but the reference one.
+    """
+    said = [camera_config(config, name).cam_from_rig for name in names]
+    if any(entry is None for index, entry in enumerate(said) if index != reference):
+        return None
+    given = [
+        nominal_transform(entry) if entry is not None else Transform.identity() for entry in said
+    ]
+    rig_from_reference = given[reference].inverse
+    return tuple(transform @ rig_from_reference for transform in given)
 
 
-def rig_priors(start: Estimate, config: RigConfig) -> dict[int, RigPrior]:
+def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, RigPrior]:
     """Priors on cam_from_rig, where rig.yaml gives one with a sigma.
 
     Without a metric scale only the rotation can be believed.
     """
+    entries = [camera_config(config, camera.name).cam_from_rig for camera in start.cameras]
+    at_reference = entries[reference]
+    rig_from_reference = Transform.identity()
+    if at_reference is not None:
+        rig_from_reference = nominal_transform(at_reference).inverse
     priors = {}
-    for index, camera in enumerate(start.cameras):
-        said = camera_config(config, camera.name).cam_from_rig
-        if said is None or (said.sigma_rotation_deg is None and said.sigma_translation is None):
+    for index, said in enumerate(entries):
+        if said is None or index == reference:
             continue
-        metric = config.scale.baseline is not None and said.sigma_translation is not None
-        priors[index] = RigPrior(
-            nominal_transform(said),
-            np.radians(said.sigma_rotation_deg) if said.sigma_rotation_deg else np.inf,
-            said.sigma_translation if metric and said.sigma_translation else np.inf,
-        )
+        metric = config.scale.baseline is not None
+        turn, move = said.sigma_rotation_deg, said.sigma_translation if metric else None
+        if turn is not None or move is not None:
+            priors[index] = RigPrior(
+                nominal_transform(said) @ rig_from_reference,
+                np.radians(turn) if turn else np.inf,
+                move or np.inf,
+            )
     return priors
+
+
+def nominal_transform(said: CamFromRigConfig) -> Transform:
+    """cam_from_rig as rig.yaml gives it."""
+    return Transform.from_wxyz(said.rotation_wxyz, said.translation)
 
 
 def start_from_config(problem: Problem, config: RigConfig) -> Problem:
@@ -131,9 +166,8 @@ def start_from_config(problem: Problem, config: RigConfig) -> Problem:
     """
     start = problem.initial
     cameras = tuple(
-        with_params(camera, {name: said.params[name] for name in said.fixed if name in said.params})
-        for camera in start.cameras
-        for said in [camera_config(config, camera.name)]
+        replace(camera, params=np.where(prior.free, camera.params, prior.mean))
+        for camera, prior in zip(start.cameras, lens_priors(start, config), strict=True)
     )
     problem = replace(problem, initial=replace(start, cameras=cameras))
     measured = config.scale.baseline

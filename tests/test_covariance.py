@@ -294,16 +294,19 @@ def test_overrated_data_pull_against_the_prior_at_their_own_noise() -> None:
 
 
 def test_clustered_variance_by_hand() -> None:
-    """Two frames of two observations, each track in both frames; two clusters count double."""
-    moved = np.array([[1.0], [2], [3], [5]])
-    scores = np.repeat(moved, 2, axis=0)
-    errors = np.tile([1.0, 0.0], 4)
+    """Two frames, two tracks, one of them seen by both cameras of the first frame: 4 pairs."""
+    scores = np.repeat([[1.0], [10], [2], [3], [5]], 2, axis=0)
+    errors = np.tile([1.0, 0.0], 5)
     seen = Observations(
-        np.zeros((4, 2)), np.array([0, 0, 1, 1]), np.zeros(4, int), np.array([0, 1, 0, 1])
+        np.zeros((5, 2)),
+        np.array([0, 0, 0, 7, 7]),
+        np.array([0, 1, 0, 0, 0]),
+        np.array([4, 4, 9, 4, 9]),
     )
-    by_frame = 2 * ((1 + 2) ** 2 + (3 + 5) ** 2)
-    by_track = 2 * ((1 + 3) ** 2 + (2 + 5) ** 2)
-    expected = by_frame + by_track - (1 + 4 + 9 + 25)
+    by_frame = 2 / 1 * ((1 + 10 + 2) ** 2 + (3 + 5) ** 2)
+    by_track = 2 / 1 * ((1 + 10 + 3) ** 2 + (2 + 5) ** 2)
+    by_both = 4 / 3 * ((1 + 10) ** 2 + 2**2 + 3**2 + 5**2)
+    expected = by_frame + by_track - by_both
     np.testing.assert_allclose(clustered_variance(scores, errors, seen), [expected])
 
 
@@ -319,14 +322,33 @@ def sheared(problem: Problem, sigma: float, seed: int) -> Problem:
     )
 
 
-def test_an_error_that_a_frame_shares_widens_the_sigmas() -> None:
-    problem = problem_of()
+def drifting(problem: Problem, sigma_px: float, seed: int) -> Problem:
+    """Every track pulled off its corner bit by bit, each its own way: a shared error."""
+    seen = problem.observations
+    pull = sigma_px * np.random.default_rng(seed).standard_normal((len(problem.initial.points), 2))
+    middle = (len(problem.frame_names) - 1) / 2
+    moved = pull[seen.point] * (seen.frame / middle - 1)[:, None]
+    return replace(
+        problem, observations=Observations(seen.pixels + moved, seen.frame, seen.camera, seen.point)
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_errors_that_a_frame_or_a_track_shares_widen_the_sigmas(seed: int) -> None:
+    problem = problem_of(seed)
     _, plain = solved(problem)
-    _, shared = solved(sheared(problem, 0.003, 0))
-    assert plain.inflation < 1.15
-    assert shared.inflation > 1.25
-    widened = {n: s / shared.model.sigma[n] for n, s in shared.stated.sigma.items()}
-    assert min(widened[f"cam{i}.{name}"] for i in range(2) for name in ("fx", "fy")) > 1.3
+    _, of_frames = solved(sheared(problem, 0.006, 0))
+    _, of_tracks = solved(drifting(problem, 1.0, 0))
+    focals = [f"cam{i}.{name}" for i in range(2) for name in ("fx", "fy")]
+
+    def widened(covariance: CalibrationCovariance) -> float:
+        sigmas = covariance.stated.sigma, covariance.model.sigma
+        return float(np.mean([sigmas[0][name] / sigmas[1][name] for name in focals]))
+
+    assert plain.inflation < 1.25
+    assert of_frames.inflation > 1.4 and widened(of_frames) > 1.8
+    assert of_tracks.inflation > 1.2 and widened(of_tracks) > 1.1 * widened(plain)
+    assert widened(of_tracks) > 1.35
 
 
 def test_widening_never_narrows_and_keeps_the_correlations() -> None:

@@ -70,12 +70,15 @@ def test_hand_eye_bears_noise() -> None:
 
 
 def test_hand_eye_bears_turns_of_more_than_half_a_circle() -> None:
-    turns, positions = wobble(8, np.array([0.3, 0.4, 0.3]))
-    turns[:, 1] += np.linspace(0, 2 * np.pi, 8, endpoint=False)
-    solved = hand_eye(*two_trajectories(turns, positions))
+    """At half a turn noise flips the axis: a's rotation vector and b's then point apart."""
+    turns, positions = wobble(24, np.array([0.05, 0.05, 0.05]))
+    turns[:, 1] += np.pi * (np.arange(24) % 2)
+    turns[:, 0] += 0.6 * (np.arange(24) % 3)
+    a, b = two_trajectories(turns, positions)
+    solved = hand_eye(noisy(a, 1e-3, 1), noisy(b, 1e-3, 2))
     assert solved is not None
-    assert angle_between(solved[0].rotation, B_FROM_A.rotation) < 1e-7
-    assert solved[1] == pytest.approx(SCALE, rel=1e-7)
+    assert angle_between(solved[0].rotation, B_FROM_A.rotation) < 3e-3
+    assert solved[1] == pytest.approx(SCALE, rel=3e-3)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +113,8 @@ TRACKS = TrackOptions(rig="triple", frames=12, points=900, sigma_px=0.0, baselin
 def models_of_cameras(
     true: Estimate, seen: Observations, groups: list[list[int]]
 ) -> list[FreeModel]:
-    """One reconstruction for each group of cameras; the second in a world of its own."""
+    """One reconstruction for each group of cameras; the second in a world of its own, its points
+    numbered the other way round."""
     models = []
     for number, group in enumerate(groups):
         own = seen.subset(np.isin(seen.camera, group))
@@ -121,7 +125,12 @@ def models_of_cameras(
             for c in group
             for f, rig in enumerate(true.rig_from_world)
         }
-        models.append(FreeModel(true.cameras, poses, (other @ true.points) * unit, own))
+        points = (other @ true.points) * unit
+        if number:
+            last = len(points) - 1
+            points = points[::-1]
+            own = Observations(own.pixels, own.frame, own.camera, last - own.point)
+        models.append(FreeModel(true.cameras, poses, points, own))
     return models
 
 

@@ -225,7 +225,7 @@ def test_sigmas_hold(loss: LossName, share: float, kind: str) -> None:
         assert 0.8 < pooled < 1.25, report
         assert rms.min() > 0.6 and rms.max() < 1.5, report
         assert np.abs(z).max() < 5, report
-    assert 1 <= inflation.mean() < 1.15
+    assert 1 <= inflation.mean() < 1.25  # the larger of two, both uncertain
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def clustered_over_model(graph: CalibrationGraph, estimate: Estimate, values: ob
     kept: list[FloatArray] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "graphs.covariance._widen", lambda model, clustered: kept.append(clustered) or model
+            "graphs.covariance._widen", lambda model, variance: kept.append(variance) or model
         )
         model = calibration_covariance(graph, estimate, values).model.matrix  # type: ignore[arg-type]
-    return np.diag(kept[0]) / np.diag(model)
+    return kept[0] / np.diag(model)

@@ -296,7 +296,7 @@ def read_tracks(folder: Path) -> tuple[Problem, Estimate]:
     except (KeyError, ValueError, IndexError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise CalibrationError(
             f"{path} is no file of simulated tracks ({error}): "
-            "write it anew with sfm-calib simulate --tracks"
+            "write it anew with sfm-calib simulate-tracks"
         ) from error
 
 
