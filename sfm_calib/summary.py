@@ -14,13 +14,19 @@ from graphs.frames import Transform
 from graphs.problem import residuals_px
 from graphs.refine import Refinement
 from graphs.scale import baseline_unit, in_unit_baseline
-from sfm_calib import result
+from sfm_calib import nominal, result
 from sfm_calib.config import RigConfig
 from sfm_calib.images import Scan
 from sfm_calib.mapping import Mapped
 
 PRIOR_DECIDES = 0.5  # of the prior's variance left: the data have said less than the belief
 FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
+REMEDIES = {  # by the first letter of the parameter
+    "f": "bring near and far things into view, and move the camera sideways",
+    "c": "turn the camera about its optical axis between views",
+    "k": "let things of the scene pass through the corners of the image",
+    "p": "turn the camera about its optical axis, and fill the corners of the image",
+}
 LIBRARIES = ("gtsam", "pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
 
 
@@ -49,14 +55,15 @@ def summarise(run: Run) -> tuple[result.Calibration, float]:
         covariance = in_unit_baseline(covariance, estimate, far)
         unit = 1.0 / float(np.linalg.norm(cam_from_rig[far].translation))
         cam_from_rig = tuple(t.scaled(unit) for t in cam_from_rig)
+    cameras = _cameras(run, covariance)
     calibration = result.Calibration(
-        cameras=_cameras(run, covariance),
+        cameras=cameras,
         rig=_rig(run, cam_from_rig, covariance, far),
         covariance=result.Covariance(
             names=covariance.names, matrix=tuple(map(tuple, covariance.matrix.tolist()))
         ),
         noise=result.Noise(sigma_px=run.refinement.sigma_px, inflation=run.covariance.inflation),
-        verdict=_verdict(run, covariance),
+        verdict=_verdict(run, cameras),
         solve=_solve(run),
         provenance=_provenance(run),
     )
@@ -126,7 +133,7 @@ def _rig(
     )
 
 
-def _verdict(run: Run, covariance: Covariance) -> result.Verdict:
+def _verdict(run: Run, cameras: dict[str, result.CameraResult]) -> result.Verdict:
     refinement, problem = run.refinement, run.refinement.problem
     messages = [*run.scan.warnings, *run.mapped.messages]
     if not refinement.summary.converged:
@@ -136,28 +143,23 @@ def _verdict(run: Run, covariance: Covariance) -> result.Verdict:
             f"only {len(problem.frame_names)} frames: sigmas rest on how much frames differ, and "
             f"fewer than {FEW_FRAMES} show that poorly; expect errors above the stated sigmas"
         )
-    weak = [
-        result.WeakDirection(
-            what=f"{name}.{parameter}",
-            effect_px=entry.sigma[parameter] if parameter in ("cx", "cy") else None,
-            remedy="turn the camera about its optical axis between views"
-            if parameter in ("cx", "cy")
-            else "cover the image corners, and near and far things",
-        )
-        for name, entry in _cameras(run, covariance).items()
-        for parameter, share in entry.prior_share.items()
-        if share > PRIOR_DECIDES
-        and parameter not in camera_fixed(run.config, name)
-        and parameter != "fy/fx"
+    believed = [
+        (name, parameter)
+        for name, entry in cameras.items()
+        for parameter in entry.params
+        if entry.prior_share.get(parameter, 0.0) > PRIOR_DECIDES
+        and parameter not in nominal.camera_config(run.config, name).fixed
     ]
-    return result.Verdict(
-        usable=refinement.summary.converged, weak=tuple(weak), messages=tuple(messages)
+    usable = refinement.summary.converged and not any(p in ("fx", "fy") for _, p in believed)
+    weak = tuple(_weak_direction(cameras[name], name, parameter) for name, parameter in believed)
+    return result.Verdict(usable=usable, weak=weak, messages=tuple(messages))
+
+
+def _weak_direction(entry: result.CameraResult, name: str, parameter: str) -> result.WeakDirection:
+    in_px = entry.sigma[parameter] if parameter in ("fx", "fy", "cx", "cy") else None
+    return result.WeakDirection(
+        what=f"{name}.{parameter}", effect_px=in_px, remedy=REMEDIES[parameter[0]]
     )
-
-
-def camera_fixed(config: RigConfig, name: str) -> tuple[str, ...]:
-    """Parameters that rig.yaml holds."""
-    return config.cameras[name].fixed if name in config.cameras else ()
 
 
 def _solve(run: Run) -> result.Solve:

@@ -11,7 +11,7 @@ import pytest
 from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.frames import FloatArray, Transform
 from graphs.gauge import GAUGE_SIGMA, Gauge, add_gauge, choose_gauge
-from graphs.keys import frame_key, rig_key
+from graphs.keys import frame_key, point_key, rig_key
 from graphs.problem import KnownBaseline, Observations, Problem
 from graphs.solve import solve
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
@@ -158,3 +158,14 @@ def test_a_hopeless_problem_is_said_not_to_have_converged() -> None:
     _, _, summary = solve(build(broken, GraphOptions(sigma_px=0.5)))
     assert not summary.converged
     assert summary.reason != "converged"
+
+
+def test_a_system_that_cannot_be_solved_is_not_called_converged() -> None:
+    """GTSAM's LM raises its lambda to the sky on a hard constraint, and stands still."""
+    problem = problem_of()
+    graph = build(problem, GraphOptions(sigma_px=0.5))
+    hard = gtsam.noiseModel.Constrained.All(3)
+    graph.factors.add(gtsam.PriorFactorPoint3(point_key(0), problem.initial.points[0], hard))
+    _, _, summary = solve(graph)
+    assert not summary.converged
+    assert "linear system" in summary.reason

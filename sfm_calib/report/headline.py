@@ -47,7 +47,7 @@ def banner(calibration: Calibration) -> Banner:
         count = len(verdict.weak)
         what = "one direction" if count == 1 else f"{count} directions"
         return Banner("doubtful", "Usable with care", f"The scan left {what} weakly determined.")
-    return Banner("good", "Usable", "The scan determined every parameter that was estimated.")
+    return Banner("good", "Usable", "The solve converged and no parameter rests on its prior.")
 
 
 def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...]:
@@ -68,7 +68,9 @@ def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...
     if noise is not None:
         figures.append(Figure(f"{noise.sigma_px:.3f} px", "noise sigma", "robust, one coordinate"))
     if solve is not None:
-        figures.append(Figure(f"{solve.rms_px:.3f} px", "RMS residual", "mismatches included"))
+        figures.append(
+            Figure(f"{solve.rms_px:.3f} px", "RMS residual", "gross mismatches set aside")
+        )
     if noise is not None:
         figures.append(
             Figure(f"× {noise.inflation:.2f}", "inflation", "stated sigma / model sigma")
