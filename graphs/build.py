@@ -44,9 +44,11 @@ class CalibrationGraph:
 def build(problem: Problem, options: GraphOptions) -> CalibrationGraph:
     """Observation, prior and gauge factors over lenses, cam_from_rig, frames and points.
 
-    Raises ValueError when the scene has no size (every image taken from one point).
+    Raises ValueError when the scene has no size (every image taken from one point), and when a
+    camera has no observation.
     """
     cameras = problem.initial.cameras
+    _check_every_camera_sees(problem)
     priors = options.lens_priors or tuple(weak_lens_prior(camera) for camera in cameras)
     factors = gtsam.NonlinearFactorGraph()
     reference.add_observations(factors, problem, observation_noise(options))
@@ -56,6 +58,17 @@ def build(problem: Problem, options: GraphOptions) -> CalibrationGraph:
         factors.add(_rig_prior_factor(index, rig_prior))
     add_gauge(factors, problem)
     return CalibrationGraph(problem, options, priors, factors, initial_values(problem))
+
+
+def _check_every_camera_sees(problem: Problem) -> None:
+    counts = np.bincount(problem.observations.camera, minlength=len(problem.initial.cameras))
+    for camera, count in zip(problem.initial.cameras, counts, strict=True):
+        if count == 0:
+            raise ValueError(
+                f"{camera.name} sees none of the {len(problem.initial.points)} points that are "
+                "consistent between views: check that its images belong to these frames, and let "
+                "it see textured things from several places"
+            )
 
 
 def observation_noise(options: GraphOptions) -> gtsam.noiseModel.Base:

@@ -16,6 +16,10 @@ from graphs.problem import Estimate, Problem
 
 RELATIVE_COST_TOLERANCE = 1e-9  # below it, no parameter moves by a hundredth of its sigma
 
+# Damping at which steps are rounding errors; at an optimum 1e4 was seen. GTSAM gets there when
+# it cannot solve the linear system at all, and then reports the unchanged cost.
+STUCK_LAMBDA = 1e10
+
 
 @dataclass(frozen=True)
 class SolveSummary:
@@ -51,7 +55,7 @@ def solve(
         if not np.isfinite(cost):
             reason = "the cost is not finite"
             break
-        if optimizer.lambda_() > params.getlambdaUpperBound():
+        if optimizer.lambda_() > STUCK_LAMBDA:
             reason = "no step lowers the cost: the linear system cannot be solved"
             break
         if previous - cost <= relative_tolerance * previous:

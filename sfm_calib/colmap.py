@@ -44,14 +44,6 @@ MAPPING_MODEL: dict[LensName, str] = {
     "radtan": "RADIAL",
     "kannala_brandt": "RADIAL_FISHEYE",
 }
-# The model that holds every parameter of the lens, for triangulating with a refined one.
-EXACT_MODEL: dict[LensName, str] = {
-    "pinhole": "PINHOLE",
-    "simple_radial": "OPENCV",
-    "radial": "OPENCV",
-    "radtan": "OPENCV",
-    "kannala_brandt": "OPENCV_FISHEYE",
-}
 
 
 def quiet(verbose: bool) -> None:
@@ -116,6 +108,8 @@ def extract_features(
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.sift.max_num_features = max_features
+    with pycolmap.Database.open(database):
+        pass  # importing images wants it to exist
     done = 0
     for index in range(len(scan.cameras)):
         reader = pycolmap.ImageReaderOptions()
@@ -126,6 +120,10 @@ def extract_features(
                 map(repr, colmap_camera(known[index], reader.camera_model).params.tolist())
             )
         paths = [image.path for image in scan.images if image.camera == index]
+        # Imported in order first: extraction numbers images as its threads finish them.
+        with _colmap_errors():
+            pycolmap.import_images(database, scan.root, pycolmap.CameraMode.SINGLE, paths, reader)
+        reader.existing_camera_id = _read_image(database, paths[0]).camera_id
         for begin in range(0, len(paths), IMAGES_A_BATCH):
             batch = paths[begin : begin + IMAGES_A_BATCH]
             with _colmap_errors():
@@ -133,8 +131,6 @@ def extract_features(
                     database, scan.root, batch, pycolmap.CameraMode.SINGLE, reader, options,
                     pycolmap.Device.cpu,
                 )  # fmt: skip
-            if begin == 0:
-                reader.existing_camera_id = _read_image(database, batch[0]).camera_id
             progress("extracting features", done := done + len(batch), len(scan.images))
 
 
@@ -300,6 +296,7 @@ def map_images(
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.random_seed = attempt.seed
+    options.num_threads = 1  # with two, sums are ordered by chance and results differ by 1e-11
     options.mapper.random_seed = attempt.seed
     options.triangulation.random_seed = attempt.seed
     # The graph has the last word: mapping may end less polished, in two thirds of the time.

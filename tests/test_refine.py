@@ -169,6 +169,14 @@ def test_progress_counts_the_iterations_of_all_rounds() -> None:
     assert seen[-1][1] == refinement.summary.cost
 
 
+def test_a_camera_that_sees_nothing_is_named() -> None:
+    problem, _ = simulate_tracks(TRACKS, np.random.default_rng(0))
+    first_only = problem.observations.subset(problem.observations.camera == 0)
+    blind = replace(problem, observations=first_only, scale=None)
+    with pytest.raises(ValueError, match="cam1 sees none of the"):
+        refine(blind, GraphOptions(), MIN_PARALLAX_DEG, NO_BUDGET)
+
+
 def test_a_scan_without_parallax_is_refused() -> None:
     problem, _ = simulate_tracks(TRACKS, np.random.default_rng(0))
     with pytest.raises(ValueError, match="move the camera sideways"):
