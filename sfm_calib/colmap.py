@@ -44,6 +44,14 @@ MAPPING_MODEL: dict[LensName, str] = {
     "radtan": "RADIAL",
     "kannala_brandt": "RADIAL_FISHEYE",
 }
+# The model that holds every parameter of the lens, to hold our results against COLMAP's.
+EXACT_MODEL: dict[LensName, str] = {
+    "pinhole": "PINHOLE",
+    "simple_radial": "OPENCV",
+    "radial": "OPENCV",
+    "radtan": "OPENCV",
+    "kannala_brandt": "OPENCV_FISHEYE",
+}
 
 
 def quiet(verbose: bool) -> None:
