@@ -72,6 +72,7 @@ def calibration_covariance(
     """Covariance of every lens parameter and every cam_from_rig at the optimum.
 
     Lens parameters that are held fixed and the reference camera are left out.
+    Raises ValueError when the problem determines less than it asks for.
     """
     problem = graph.problem
     residuals = residuals_px(estimate, problem.observations)
@@ -148,7 +149,14 @@ def influence(system: LinearisedSystem, row_scale: FloatArray, columns: IntArray
     place = np.searchsorted(others, columns)
     rhs = np.zeros((len(others), len(columns)))
     rhs[place, np.arange(len(columns))] = 1 / norms[place]
-    solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), rhs)
+    try:
+        solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), rhs)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            "the scan leaves the calibration undetermined (its normal equations are singular): "
+            "take more views, moving sideways and turning, or hold fewer parameters at values "
+            "that contradict it"
+        ) from error
     return (a @ solution - basis @ (along_points @ solution)) / row_scale[:, None]
 
 

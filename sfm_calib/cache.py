@@ -32,14 +32,14 @@ class Cache:
         """
         place, key_file = self.folder / name, self.folder / f"{name}.key"
         key = key_of(inputs)
-        if not self.fresh and place.is_dir() and _text(key_file) == key:
+        if not self.fresh and _text(key_file) == key + _sizes(place):
             return place
         try:
             key_file.unlink(missing_ok=True)
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
             make(place)
-            write_atomically(key_file, key)
+            write_atomically(key_file, key + _sizes(place))
         except BaseException as error:
             reason = _disk_trouble(place, error)
             self._drop(place)
@@ -55,6 +55,17 @@ class Cache:
         shutil.rmtree(place, ignore_errors=True)
         with suppress(OSError):
             self.folder.rmdir()
+
+
+def _sizes(place: Path) -> str:
+    """The size of every file of a stage: readers of a shortened model hang rather than fail."""
+    files = sorted(path for path in place.rglob("*") if path.is_file())
+    sizes = [
+        f"{path.relative_to(place).as_posix()} {path.stat().st_size}"
+        for path in files
+        if not path.name.endswith(("-wal", "-shm"))  # SQLite's own, there while it is open
+    ]
+    return "\n" + "\n".join(sizes)
 
 
 def _disk_trouble(place: Path, error: BaseException) -> str | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from graphs.build import GraphOptions
-from graphs.covariance import calibration_covariance
+from graphs.covariance import CalibrationCovariance, calibration_covariance
 from graphs.problem import Problem
 from graphs.refine import Refinement, refine
 from sfm_calib.cache import Cache
@@ -72,9 +72,7 @@ def calibrate(
         refinement = solve_problem(problem, config, progress)
     with watch.stage("covariance"):
         progress("covariance", 0, 0)
-        covariance = calibration_covariance(
-            refinement.graph, refinement.estimate, refinement.values
-        )
+        covariance = covariance_of(refinement)
     run = Run(scan, config, mapped, refinement, covariance, watch.seconds, command)
     calibration, unit = summarise(run)
     return Outcome(calibration, refinement, unit)
@@ -95,5 +93,13 @@ def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Re
             config.max_observations,
             on_iteration=lambda iteration, cost: progress("solving", iteration, 0),
         )
+    except ValueError as error:
+        raise CalibrationError(str(error)) from error
+
+
+def covariance_of(refinement: Refinement) -> CalibrationCovariance:
+    """The joint covariance at the optimum, as `calibration_covariance`."""
+    try:
+        return calibration_covariance(refinement.graph, refinement.estimate, refinement.values)
     except ValueError as error:
         raise CalibrationError(str(error)) from error

@@ -19,7 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from graphs.frames import Transform
-from graphs.lenses import PARAMETER_NAMES, Camera, LensName
+from graphs.lenses import PARAMETER_NAMES, Camera, LensName, nominal_params
 from graphs.problem import Observations
 from graphs.rig_start import FreeModel
 from sfm_calib.errors import CalibrationError
@@ -32,6 +32,7 @@ PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
 GLOBAL_ADJUSTMENT_GROWTH = 1.3  # of the model between two global adjustments
+FISHEYE_FOCAL = 0.5  # of the longer side: some 115 degrees across
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
 # COLMAP's names of its parameters, where they are not ours.
@@ -123,9 +124,12 @@ def extract_features(
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = MAPPING_MODEL[lenses[index]]
         reader.default_focal_length_factor = DEFAULT_FOCAL
-        if index in known:
+        start = known.get(index)
+        if start is None and lenses[index] == "kannala_brandt":
+            start = _fisheye_guess(scan, index)
+        if start is not None:
             reader.camera_params = ",".join(
-                map(repr, colmap_camera(known[index], reader.camera_model).params.tolist())
+                map(repr, colmap_camera(start, reader.camera_model).params.tolist())
             )
         paths = [image.path for image in scan.images if image.camera == index]
         # Imported in order first: extraction numbers images as its threads finish them.
@@ -140,6 +144,13 @@ def extract_features(
                     pycolmap.Device.cpu,
                 )  # fmt: skip
             progress("extracting features", done := done + len(batch), len(scan.images))
+
+
+def _fisheye_guess(scan: Scan, index: int) -> Camera:
+    # COLMAP verifies no pair of a fisheye whose focal length is its own guess.
+    size = scan.sizes[index]
+    params = nominal_params("kannala_brandt", size, FISHEYE_FOCAL * max(size))
+    return Camera(scan.cameras[index], "kannala_brandt", size, params)
 
 
 def _read_image(database: Path, path: str) -> pycolmap.Image:

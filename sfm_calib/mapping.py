@@ -75,7 +75,10 @@ def map_scan(
         inputs,
         lambda place: run_apart(_map, (scan, config, nominal, database, place), progress),
     )
-    models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
+    try:
+        models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"{place} is damaged: run again with --fresh") from error
     model, cam_from_rig = _one_model(scan, models, reference, database)
     problem, dropped = impose_rig(model, cam_from_rig, scan.frames, reference)
     return Mapped(problem, _messages(scan, model, dropped), hashes)
