@@ -163,10 +163,21 @@ def test_an_interrupt_is_no_traceback(capsys, monkeypatch):
     assert capsys.readouterr().err.startswith("sfm-calib: interrupted")
 
 
+def heed_interrupts():
+    """A background job is born deaf to Ctrl-C, and so are its children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def stop_at(stage, how, out):
     """Start the program, and stop it where the stage begins. Its exit code and the delay."""
     command = [sys.executable, "-m", "sfm_calib", *arguments_of(simulation() / "scan", out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed_interrupts,
+    )
     with process:
         for line in process.stderr:
             if line.startswith(stage):
