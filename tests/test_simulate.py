@@ -12,16 +12,17 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from synthetic.scans import simulation
 
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import Camera, LensName, project, unproject
 from sfm_calib.errors import CalibrationError
-from sfm_calib.result import load_calibration
+from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate import render as rendering
 from sfm_calib.simulate.render import RenderOptions, ray_table, render
 from sfm_calib.simulate.rigs import CAMERA_COUNT, TrajectoryName, make_rig, make_trajectory
 from sfm_calib.simulate.room import Room, build_room, import_open3d
-from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
+from sfm_calib.simulate.scan import SimulateOptions, rig_like, simulate_scan
 from sfm_calib.simulate.textures import pink_noise
 
 try:
@@ -324,3 +325,21 @@ def test_missing_open3d_is_one_line_with_the_remedy(
         simulate_scan(SMALL, tmp_path / "out", silent)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rig_like_a_calibration(tmp_path):
+    pytest.importorskip("open3d", exc_type=ImportError)
+    path = simulation() / "truth.json"
+    options = SimulateOptions(like=path, frames=1, supersampling=1, noise=0)
+    calibration = simulate_scan(options, tmp_path / "out", lambda *done: None)
+    original = load_calibration(path)
+    assert calibration.cameras == original.cameras
+    ours, theirs = calibration.cam_from_rig("cam1"), original.cam_from_rig("cam1")
+    np.testing.assert_allclose(ours.rotation, theirs.rotation, atol=1e-12)
+    np.testing.assert_allclose(ours.translation, theirs.translation, atol=1e-12)
+    image = cv2.imread(str(tmp_path / "out" / "scan" / "cam1" / "000000.png"))
+    assert image.shape[1::-1] == original.cameras["cam1"].size and image.std() > 10
+    turned = original.model_copy(update={"rig": original.rig.model_copy(update={"metric": False})})
+    save_calibration(turned, tmp_path / "unit.json")
+    with pytest.raises(CalibrationError, match="not metric"):
+        rig_like(tmp_path / "unit.json")

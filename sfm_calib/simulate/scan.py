@@ -20,7 +20,7 @@ import sfm_calib
 from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.errors import CalibrationError
-from sfm_calib.result import Calibration, save_calibration, truth
+from sfm_calib.result import Calibration, load_calibration, save_calibration, truth
 from sfm_calib.simulate.render import SUPERSAMPLING, RenderOptions, ray_table, render
 from sfm_calib.simulate.rigs import (
     PRESET_WIDTH,
@@ -35,6 +35,7 @@ from sfm_calib.simulate.room import TEXELS_PER_M, BoardName, HungBoard, Room, bu
 Progress = Callable[[str, int, int], None]
 
 BASELINE_SIGMA_M = 0.0005  # a tape measure; ten times the rounding of the length written
+SHORTEST_BASELINE_M = 0.01  # a shorter one nobody measures
 SMALLEST_SIDE, LARGEST_SIDE = 64, 4096
 MOST_RAYS = 200_000_000  # an image: 2.4 GB of directions
 MOST_FRAMES = 1_000_000  # stems have six digits
@@ -49,6 +50,8 @@ class SimulateOptions(BaseModel):
 
     rig: RigName = "triple"
     """Cameras and how they sit on the rig."""
+    like: Path | None = None
+    """A calibration.json whose cameras and rig take the preset's place."""
     trajectory: TrajectoryName = "handheld"
     """How the rig moves through the room."""
     frames: int = 40
@@ -81,7 +84,7 @@ def simulate_scan(
     check_options(options)
     out = out.absolute()
     _refuse_occupied(out, overwrite)
-    rig = make_rig(options.rig, options.lens, options.size)
+    rig = rig_like(options.like) if options.like else preset_rig(options)
     rig_from_world = make_trajectory(options.trajectory, options.frames, _rng(options, 1))
     calibration = truth(list(rig.cameras), list(rig.cam_from_rig), sfm_calib.__version__)
     progress("room", 0, 1)
@@ -97,6 +100,33 @@ def simulate_scan(
             _write_board(room.board, staging)
         _install(staging, out)
     return calibration
+
+
+def preset_rig(options: SimulateOptions) -> SimulatedRig:
+    """The rig that the options name."""
+    return make_rig(options.rig, options.lens, options.size)
+
+
+def rig_like(path: Path) -> SimulatedRig:
+    """The cameras and the rig of a calibration, its reference first.
+
+    Raises CalibrationError when it cannot be read, or its lengths are not metres.
+    """
+    calibration = load_calibration(path)
+    first = calibration.rig.reference
+    names = [first, *(name for name in calibration.cameras if name != first)]
+    if len(names) > 1 and not calibration.rig.metric:
+        raise CalibrationError(
+            f"{path} is not metric ({calibration.rig.scale.source}) and the room is: calibrate "
+            "with scale.baseline in rig.yaml"
+        )
+    for name in names:
+        if name != Path(name).name:
+            raise CalibrationError(f"{path}: the camera {name!r} cannot be a folder: rename it")
+    return SimulatedRig(
+        tuple(calibration.camera(name) for name in names),
+        tuple(calibration.cam_from_rig(name) for name in names),
+    )
 
 
 def check_options(options: SimulateOptions) -> None:
@@ -163,6 +193,8 @@ def _write_rig(rig: SimulatedRig, path: Path) -> None:
     if len(rig.cameras) < 2:
         return
     first, second = (t.inverse.translation for t in rig.cam_from_rig[:2])
+    if float(np.linalg.norm(second - first)) < SHORTEST_BASELINE_M:
+        return
     baseline = {
         "cameras": [camera.name for camera in rig.cameras[:2]],
         "length_m": round(float(np.linalg.norm(second - first)), 4),
