@@ -287,7 +287,7 @@ def run_demo(command: Demo) -> None:
             truth = simulate_scan(options, out, progress, overwrite=True)
         scan = out / "scan"
         config = load_rig_config(scan / RIG_FILE).model_copy(
-            update={"seed": command.seed, "max_features": DEMO_FEATURES, "pairs": "selected"}
+            update={"seed": command.seed, "max_features": DEMO_FEATURES}
         )
         arguments = ["demo", "-o", os.fspath(out), "--seed", str(command.seed)]
         outcome = calibrate_into(out, scan, config, False, command.verbose, arguments)
