@@ -10,9 +10,11 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import tyro
 import yaml
 from pydantic import BaseModel, ConfigDict
 
@@ -50,7 +52,7 @@ class SimulateOptions(BaseModel):
 
     rig: RigName = "triple"
     """Cameras and how they sit on the rig."""
-    like: Path | None = None
+    like: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A calibration.json whose cameras and rig take the preset's place."""
     trajectory: TrajectoryName = "handheld"
     """How the rig moves through the room."""
