@@ -33,6 +33,10 @@ class LensPrior:
         """Which parameters are not held fixed (n_params,)."""
         return self.sigma > PINNED_SIGMA
 
+    def held(self, params: FloatArray) -> FloatArray:
+        """Parameters (n_params,) with those that are held fixed exactly at their values."""
+        return np.where(self.free, params, self.mean)
+
     def information(self) -> FloatArray:
         """Information matrix (n_params, n_params) at the mean, the aspect term included."""
         information = np.diag(self.sigma**-2.0)

@@ -311,7 +311,10 @@ def attempts(seed: int) -> list[MappingAttempt]:
 def map_images(
     scan: Scan, database: Path, out: Path, attempt: MappingAttempt, progress: Progress
 ) -> list[pycolmap.Reconstruction]:
-    """Incremental mapping without rig constraints: models, the one with most images first."""
+    """Incremental mapping: models, the one with most images first.
+
+    Images are placed freely, unless `constrain_rig` was told of the database.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.random_seed = attempt.seed

@@ -12,7 +12,7 @@ from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, Camera, LensName, nominal_params
 from graphs.priors import LensPrior, RigPrior, stated_lens_prior, weak_lens_prior
 from graphs.problem import Estimate, KnownBaseline, Problem
-from sfm_calib.config import CameraConfig, CamFromRigConfig, RigConfig
+from sfm_calib.config import CameraConfig, RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Scan
 
@@ -112,21 +112,26 @@ def lens_priors(start: Estimate, config: RigConfig) -> tuple[LensPrior, ...]:
     return tuple(priors)
 
 
+def nominal_transforms(
+    config: RigConfig, names: Sequence[str], reference: int
+) -> list[Transform | None]:
+    """cam_from_rig as rig.yaml gives it, the reference's frame as the rig's; None where it does
+    not say."""
+    given = [
+        Transform.from_wxyz(said.rotation_wxyz, said.translation) if said is not None else None
+        for said in (camera_config(config, name).cam_from_rig for name in names)
+    ]
+    at_reference = given[reference] or Transform.identity()
+    given[reference] = at_reference
+    return [None if one is None else one @ at_reference.inverse for one in given]
+
+
 def nominal_rig(
     config: RigConfig, names: Sequence[str], reference: int
 ) -> tuple[Transform, ...] | None:
-    """cam_from_rig of every camera as rig.yaml gives it, the reference's frame as the rig's.
-
-    None unless it gives every camera but the reference one.
-    """
-    said = [camera_config(config, name).cam_from_rig for name in names]
-    if any(entry is None for index, entry in enumerate(said) if index != reference):
-        return None
-    given = [
-        nominal_transform(entry) if entry is not None else Transform.identity() for entry in said
-    ]
-    rig_from_reference = given[reference].inverse
-    return tuple(transform @ rig_from_reference for transform in given)
+    """The nominal cam_from_rig of every camera; None unless all but the reference are given."""
+    given = [one for one in nominal_transforms(config, names, reference) if one is not None]
+    return tuple(given) if len(given) == len(names) else None
 
 
 def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, RigPrior]:
@@ -134,29 +139,19 @@ def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, 
 
     Without a metric scale only the rotation can be believed.
     """
-    entries = [camera_config(config, camera.name).cam_from_rig for camera in start.cameras]
-    at_reference = entries[reference]
-    rig_from_reference = Transform.identity()
-    if at_reference is not None:
-        rig_from_reference = nominal_transform(at_reference).inverse
+    names = [camera.name for camera in start.cameras]
+    metric = config.scale.baseline is not None
     priors = {}
-    for index, said in enumerate(entries):
-        if said is None or index == reference:
+    for index, transform in enumerate(nominal_transforms(config, names, reference)):
+        said = camera_config(config, names[index]).cam_from_rig
+        if said is None or transform is None or index == reference:
             continue
-        metric = config.scale.baseline is not None
         turn, move = said.sigma_rotation_deg, said.sigma_translation if metric else None
         if turn is not None or move is not None:
             priors[index] = RigPrior(
-                nominal_transform(said) @ rig_from_reference,
-                np.radians(turn) if turn else np.inf,
-                move or np.inf,
+                transform, np.radians(turn) if turn else np.inf, move or np.inf
             )
     return priors
-
-
-def nominal_transform(said: CamFromRigConfig) -> Transform:
-    """cam_from_rig as rig.yaml gives it."""
-    return Transform.from_wxyz(said.rotation_wxyz, said.translation)
 
 
 def start_from_config(problem: Problem, config: RigConfig) -> Problem:
@@ -166,7 +161,7 @@ def start_from_config(problem: Problem, config: RigConfig) -> Problem:
     """
     start = problem.initial
     cameras = tuple(
-        replace(camera, params=np.where(prior.free, camera.params, prior.mean))
+        replace(camera, params=prior.held(camera.params))
         for camera, prior in zip(start.cameras, lens_priors(start, config), strict=True)
     )
     problem = replace(problem, initial=replace(start, cameras=cameras))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -88,16 +88,11 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
         if np.isfinite(prior.aspect_sigma):
             ratio = covariance.of_difference(f"{camera.name}.fy", f"{camera.name}.fx")
             share["fy/fx"] = min((ratio / camera.params[0] / prior.aspect_sigma) ** 2, 1.0)
-        held = {
-            p: float(mean)
-            for p, mean, free in zip(camera.names, prior.mean, prior.free, strict=True)
-            if not free
-        }
         rows = seen.camera == index
         entries[camera.name] = result.CameraResult(
             lens=camera.lens,
             size=camera.size,
-            params=nominal.with_params(camera, held).named(),
+            params=replace(camera, params=prior.held(camera.params)).named(),
             sigma=own,
             prior_share=share,
             n_images=len(np.unique(seen.frame[rows])),
