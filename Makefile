@@ -34,8 +34,8 @@ check: $(STAMP) ## formatting, lint and types
 	@status=0; for tool in "ruff format --check ." "ruff check ." mypy; do \
 	  $(BIN)/$$tool || status=1; done; exit $$status
 
-bench: $(STAMP) ## run the benchmarks (out/bench)
-	@$(BIN)/python -m experiments.bench
+bench: $(STAMP) ## run the benchmarks (out/bench; ARGS=--quick for the small ones)
+	@$(BIN)/python -m experiments.bench $(ARGS)
 
 venv: $(STAMP) ## only set up .venv
 

@@ -6,20 +6,34 @@ frame, one cam_from_rig a camera, a full OPENCV lens a camera, the points.
 
 from __future__ import annotations
 
+import ctypes
+import os
+import sys
+import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
+from pycolmap._core import pyceres
 
 from graphs.build import GraphOptions
 from graphs.frames import FloatArray, Transform
 from graphs.problem import Estimate, IntArray, Problem
-from sfm_calib.colmap import EXACT_MODEL, PIXEL_OFFSET, camera_from_colmap, colmap_camera, quiet
+from sfm_calib.colmap import PIXEL_OFFSET, camera_from_colmap, colmap_camera, quiet
+from sfm_calib.colmap_lenses import EXACT_MODEL
 
 # COLMAP turns to iterative solvers above 1,000 images: 4 to 5 times slower at the same cost.
 MOST_IMAGES_DIRECT = 10**6
+# COLMAP's own choice between a dense and a sparse direct solver stands: sparse above 50 images.
+# Dense takes as long at 150 and 600 images (25k, 100k and 400k observations), and 3.5 times as
+# long at 3,000 (400k).
+# COLMAP's Levenberg-Marquardt takes 16, 24, 28 and 24 iterations at 25k, 100k, 400k (600 images)
+# and 400k (3,000); dogleg steps take 17, 18, 17 and 18, each as long, to the same cost.
+STRATEGY = pyceres.TrustRegionStrategyType.DOGLEG
+TABLE_COLUMNS = 10  # of what Ceres prints: iter, cost, cost_change, ..., total_time
 FIRST_ID = 1  # COLMAP counts from one
 EXACT_LENSES = ("pinhole", "radtan", "kannala_brandt")  # COLMAP has these, no more and no less
 LOSSES = {
@@ -37,6 +51,7 @@ class CeresResult:
     seconds: float
     iterations: int
     converged: bool
+    trace: list[tuple[float, float]]  # after each iteration: seconds since the start, lowest cost
 
 
 def ceres_bundle_adjust(
@@ -47,7 +62,7 @@ def ceres_bundle_adjust(
     A direct solver, all cores, the gauge fixed; the model is loaded before the clock starts.
     Raises ValueError for a problem that COLMAP cannot state exactly.
     """
-    _check_exact(problem)
+    _check_exact(problem, options)
     quiet(verbose=False)
     model = reconstruction_of(problem)
     config = pycolmap.BundleAdjustmentConfig()
@@ -57,7 +72,9 @@ def ceres_bundle_adjust(
     settings = _settings(options, relative_tolerance, max_iterations)
     start = time.perf_counter()
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(settings, config, model)
-    summary: Any = adjuster.solve()  # the stub names the base class, without Ceres's own summary
+    loaded = time.perf_counter() - start
+    # The stub names the base class, without Ceres's own summary.
+    summary, table = captured(lambda: cast(Any, adjuster.solve()))
     seconds = time.perf_counter() - start
     report = summary.ceres_summary
     return CeresResult(
@@ -65,15 +82,52 @@ def ceres_bundle_adjust(
         seconds,
         report.num_successful_steps + report.num_unsuccessful_steps,
         bool(summary.is_solution_usable()),
+        [(loaded + at, cost) for at, cost in trace_of(table, report.final_cost)],
     )
 
 
-def _check_exact(problem: Problem) -> None:
+def captured(call: Callable[[], Any]) -> tuple[Any, str]:
+    """The result of a call, and what compiled code printed on standard output meanwhile."""
+    sys.stdout.flush()
+    with tempfile.TemporaryFile("w+") as file:
+        stdout = os.dup(1)
+        os.dup2(file.fileno(), 1)
+        try:
+            result = call()
+        finally:
+            ctypes.CDLL(None).fflush(None)  # a file is written to in blocks
+            os.dup2(stdout, 1)
+            os.close(stdout)
+        file.seek(0)
+        return result, file.read()
+
+
+def trace_of(table: str, final_cost: float) -> list[tuple[float, float]]:
+    """Seconds and lowest cost after each iteration, from the table that Ceres prints.
+
+    Costs are summed up from the decreases, backwards: those have three digits, whereas the
+    costs' own seven could not show the last of them.
+    """
+    rows = [line.split() for line in table.splitlines()]
+    rows = [row for row in rows if len(row) == TABLE_COLUMNS and row[0].isdigit()]
+    trace = []
+    cost = final_cost
+    for row in reversed(rows):
+        trace.append((float(row[-1]), cost))
+        cost += max(float(row[2]), 0.0)  # a step that raises the cost is refused
+    return trace[::-1]
+
+
+def _check_exact(problem: Problem, options: GraphOptions) -> None:
     if problem.scale is not None:
         raise ValueError("COLMAP has no measured baselines: give a problem without one")
     for camera in problem.initial.cameras:
         if camera.lens not in EXACT_LENSES:
             raise ValueError(f"COLMAP would free more than {camera.lens}: use {EXACT_LENSES}")
+    if options.loss not in LOSSES:
+        raise ValueError(f"COLMAP has no loss {options.loss}: use one of {tuple(LOSSES)}")
+    if problem.observations.relative_sigma is not None:
+        raise ValueError("COLMAP weighs all observations alike: give none a sigma of its own")
 
 
 def _settings(
@@ -88,9 +142,12 @@ def _settings(
     # GTSAM: k^2/2 log(1 + r^2 / k^2) of r in sigmas; Ceres: a^2/2 log(1 + r^2 / a^2) of r in px.
     ceres.loss_function_type = LOSSES[options.loss]
     ceres.loss_function_scale = options.loss_scale * options.sigma_px
+    ceres.solver_options.trust_region_strategy_type = STRATEGY
     ceres.solver_options.function_tolerance = relative_tolerance
     ceres.solver_options.gradient_tolerance = 0.0
     ceres.solver_options.max_num_iterations = max_iterations
+    ceres.solver_options.minimizer_progress_to_stdout = True
+    ceres.solver_options.logging_type = pyceres.LoggingType.PER_MINIMIZER_ITERATION
     return settings
 
 

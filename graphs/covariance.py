@@ -1,6 +1,6 @@
 """Joint covariance of all lenses and rig extrinsics, everything else marginalised, labelled.
 
-The linearised graph H = A'A is reduced exactly: points by projection, then frames. The
+Points and frames are eliminated exactly; what is left is the information of the calibration. The
 model covariance assumes independent observations of the estimated noise; the clustered one
 only that observations err independently which share neither their frame nor their track: the
 two-way sandwich of Cameron, Gelbach and Miller (JBES 2011). The stated sigma is the larger of
@@ -11,25 +11,34 @@ its corner as the view changes, and takes its whole track along.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
 from graphs.build import CalibrationGraph
+from graphs.clusters import Cluster, homogeneous
+from graphs.elimination import NotPositiveDefiniteError
 from graphs.frames import FloatArray, reported_from_tangent
-from graphs.keys import frame_key, lens_key, point_key, rig_key
+from graphs.gauge import undetermined
+from graphs.keys import lens_key, rig_key
 from graphs.noise import loss_moments
-from graphs.problem import Estimate, IntArray, Observations, residuals_px
-from graphs.reference import NATIVE_SIZE, native_slots
+from graphs.points import follow_points, respond
+from graphs.problem import Estimate, IntArray, residuals_px
+from graphs.solve import threads
+from graphs.system import System, assemble, jacobian_of
+from graphs.tracks import Variables, rows_of
 
 POSE_NAMES = (
     *(f"rotation_{axis}" for axis in "xyz"),
     *(f"translation_{axis}" for axis in "xyz"),
 )
-RANK_TOLERANCE = 1e-13  # of a point's strongest direction: below, rounding
+# A smaller pivot has the system examined for directions that nothing determines; in real scans the
+# smallest are 1e-6, without a gauge they end at 1e-12 to 1e-15.
+SUSPICIOUS_PIVOT = 1e-8
 MIN_CLUSTERS = 5  # fewer frames cannot show how much frames differ
 
 
@@ -75,140 +84,136 @@ def calibration_covariance(
     Raises ValueError when the problem determines less than it asks for.
     """
     problem = graph.problem
-    residuals = residuals_px(estimate, problem.observations)
-    moments = loss_moments(problem, graph.options, residuals)
-    system = linearised_system(graph, values)
-    n_rows = 2 * len(problem.observations)
-    scale = np.ones(system.jacobian.shape[0])
-    scale[:n_rows] = moments.curvature**0.5
-    columns, names, to_reported = _calibration_columns(graph, estimate, system.first_column)
-    scores = influence(system, scale, columns) @ to_reported.T
-    of_data, of_priors = scores[:n_rows], scores[n_rows:].T @ scores[n_rows:]
-    model = Covariance(names, moments.score_variance * of_data.T @ of_data + of_priors)
-    seen = problem.observations
-    if len(np.unique(seen.frame)) < MIN_CLUSTERS:
-        return CalibrationCovariance(model, model)
-    clustered = moments.refit * clustered_variance(of_data, system.rhs[:n_rows], seen)
-    widened = _widen(model.matrix, clustered + np.diag(of_priors))
-    return CalibrationCovariance(Covariance(names, widened), model)
+    moments = loss_moments(problem, graph.options, residuals_px(estimate, problem.observations))
+    variables = graph.variables(values)
+    points = homogeneous(graph.tracks, estimate.points)
+    others = graph.others.linearize(values)
+    columns, names, to_reported = calibration_columns(graph, estimate)
+    with threads() as pool:
+        system = assemble(
+            graph.tracks, others, graph.layout, variables, points, pool, moments.curvature
+        )
+        response = responses(graph, system, columns) @ to_reported.T
+        of_priors = jacobian_of(others, graph.layout)[0] @ response
+        prior_part = of_priors.T @ of_priors
+        data_part = (to_reported @ response[columns] - prior_part) / moments.curvature
+        model = Covariance(names, moments.score_variance * data_part + prior_part)
+        if len(np.unique(problem.observations.frame)) < MIN_CLUSTERS:
+            return CalibrationCovariance(model, model)
+        clustered = clustered_variance(graph, variables, points, response, pool)
+    variance = moments.refit * clustered + np.diag(prior_part)
+    return CalibrationCovariance(Covariance(names, _widen(model.matrix, variance)), model)
 
 
-@dataclass(frozen=True)
-class LinearisedSystem:
-    """A whitened Jacobian and right-hand side, and where each variable's columns start."""
+def responses(graph: CalibrationGraph, system: System, columns: IntArray) -> FloatArray:
+    """Columns of the inverse normal equations (n_columns, len(columns)).
 
-    jacobian: scipy.sparse.csr_array  # (n_rows, n_columns), robust weights in it
-    rhs: FloatArray  # (n_rows,) minus the weighted whitened residual
-    first_column: dict[int, int]  # key -> column
-    n_points: int
-    first_point: int  # column of the first point
-
-
-def linearised_system(graph: CalibrationGraph, values: gtsam.Values) -> LinearisedSystem:
-    """The graph linearised at `values`, in GTSAM's order of keys; observations come first."""
-    linear = graph.factors.linearize(values)
-    rows, columns, entries = linear.sparseJacobian_()
-    shape = (int(rows.max()), int(columns.max()))
-    whole = scipy.sparse.csr_array(
-        (entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape
-    )
-    start = graph.problem.initial
-    sizes = {lens_key(i): NATIVE_SIZE for i in range(len(start.cameras))}
-    sizes |= {rig_key(i): 6 for i in range(len(start.cameras))}
-    sizes |= {frame_key(i): 6 for i in range(len(start.rig_from_world))}
-    sizes |= {point_key(i): 3 for i in range(len(start.points))}
-    first_column, offset = {}, 0
-    for key in sorted(sizes):
-        first_column[key] = offset
-        offset += sizes[key]
-    return LinearisedSystem(
-        whole[:, :offset],
-        np.ravel(whole[:, [offset]].toarray()),
-        first_column,
-        len(start.points),
-        first_column[point_key(0)],
-    )
-
-
-def influence(system: LinearisedSystem, row_scale: FloatArray, columns: IntArray) -> FloatArray:
-    """What a unit of each row's error does to the unknowns `columns`, (n_rows, len(columns)).
-
-    A (A' W A)^-1 with W = diag(row_scale)^2. Points are projected out, row by row and stably;
-    the rest is dense, scaled to a unit diagonal so that pixels, radians and distortion
-    coefficients are inverted equally well.
+    Raises ValueError, naming the variable, when they are singular.
     """
-    scaled = (scipy.sparse.diags_array(row_scale) @ system.jacobian).tocsc()
-    points = slice(system.first_point, system.first_point + 3 * system.n_points)
-    others = np.delete(np.arange(scaled.shape[1]), points)
-    basis = _point_basis(scaled[:, points], system.n_points)
-    a = scaled[:, others]
-    norms = np.sqrt(np.asarray(a.multiply(a).sum(0)).ravel())
-    a = (a @ scipy.sparse.diags_array(1 / norms)).tocsr()
-    along_points = (basis.T @ a).tocsr()  # (3 n_points, n_others)
-    reduced = (a.T @ a - along_points.T @ along_points).toarray()
-    place = np.searchsorted(others, columns)
-    rhs = np.zeros((len(others), len(columns)))
-    rhs[place, np.arange(len(columns))] = 1 / norms[place]
+    unit = np.zeros((system.elimination.n_columns, len(columns)))
+    unit[columns, np.arange(len(columns))] = 1.0
     try:
-        solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), rhs)
-    except np.linalg.LinAlgError as error:
-        raise ValueError(
-            "the scan leaves the calibration undetermined (its normal equations are singular): "
-            "take more views, moving sideways and turning, or hold fewer parameters at values "
-            "that contradict it"
-        ) from error
-    return (a @ solution - basis @ (along_points @ solution)) / row_scale[:, None]
+        factor = system.factorise()
+        smallest = factor.smallest_pivot()[0]
+    except NotPositiveDefiniteError:
+        smallest = 0.0
+    if smallest < SUSPICIOUS_PIVOT and (why := undetermined(graph.problem, graph.layout, system)):
+        raise ValueError(why)
+    return factor.solve(unit)
 
 
-def _point_basis(a_points: scipy.sparse.csc_array, n_points: int) -> scipy.sparse.csr_array:
-    """Orthonormal basis (n_rows, 3 n_points) of what moving each point does to its rows.
+def clustered_variance(
+    graph: CalibrationGraph,
+    variables: Variables,
+    points: FloatArray,
+    response: FloatArray,
+    pool: ThreadPoolExecutor,
+) -> FloatArray:
+    """Variances (n,) of unknowns when what shares a frame or a track may err together.
 
-    Not by normal equations: a mismatched track may end a micrometre before a camera, and the
-    square of its Jacobian drowns everything else.
+    response (n_columns, n): what a unit of each column's gradient does to them. By frame plus by
+    track less what both count, and never less than either alone.
     """
-    entries = a_points.tocoo()
-    blocks = np.zeros((a_points.shape[0], 3))
-    blocks[entries.row, entries.col % 3] = entries.data
-    owner = np.full(a_points.shape[0], n_points)  # of rows without a point: none
-    owner[entries.row] = entries.col // 3
-    by_owner = np.argsort(owner, kind="stable")
-    length = np.bincount(owner, minlength=n_points)[:n_points]
-    first = np.cumsum(length) - length
-    directions = np.zeros_like(blocks)
-    for size in np.unique(length[length > 0]):
-        starts = first[length == size]
-        rows = by_owner[starts[:, None] + np.arange(size)]  # (n_such, size)
-        left, spread, _ = np.linalg.svd(blocks[rows], full_matrices=False)
-        left *= (spread > RANK_TOLERANCE * spread[:, :1])[:, None, :]
-        directions[rows, : left.shape[2]] = left
-    row = np.repeat(np.flatnonzero(owner < n_points), 3)
-    column = (3 * owner[:, None] + np.arange(3))[owner < n_points].ravel()
-    return scipy.sparse.csr_array(
-        (directions[owner < n_points].ravel(), (row, column)), a_points.shape
-    )
+    n_frames, n = len(graph.problem.frame_names), response.shape[1]
+
+    def run(cluster: Cluster) -> ClusterSums:
+        sums = ClusterSums(n_frames, n)
+        for frame, begins, moved, _ in influences(graph, cluster, variables, points, response):
+            sums.add(moved, frame, begins)
+        return sums
+
+    total = ClusterSums(n_frames, n)
+    for sums in pool.map(run, graph.tracks.clusters):
+        total.merge(sums)
+    return total.variance()
 
 
-def clustered_variance(scores: FloatArray, rhs: FloatArray, seen: Observations) -> FloatArray:
-    """Variances (n,) when what shares a frame or a track may err together.
+def influences(
+    graph: CalibrationGraph,
+    cluster: Cluster,
+    variables: Variables,
+    points: FloatArray,
+    response: FloatArray,
+) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
+    """Chunk by chunk: the frame of each observation, where tracks begin, how far each residual
+    moves the unknowns (n_obs, n), and each track's squared response (n_tracks,)."""
+    layout, n = graph.layout, response.shape[1]
+    start = 6 * len(layout.elimination.order)
+    frames = 6 * cluster.frames[:, None] + np.arange(6)
+    place = np.append(frames.ravel(), start + np.arange(layout.of_tracks.width))
+    G = response[place]
+    for chunk in rows_of(graph.tracks, cluster, variables, points[cluster.points]):
+        n_rows, begins = len(chunk.rows), chunk.begins[chunk.active]
+        of_rows, moved = np.empty((n_rows, 2, n)), np.empty((n_rows, n))
+        leverage = np.empty(len(begins))
+        respond(
+            chunk.rows, chunk.of_frame, chunk.of_rig, chunk.of_lens, chunk.n_frames,
+            *layout.of_tracks.places, G, of_rows,
+        )  # fmt: skip
+        follow_points(
+            chunk.active, chunk.begins, chunk.points, chunk.smallest_w, chunk.residuals,
+            chunk.of_point, of_rows, moved, leverage,
+        )  # fmt: skip
+        yield cluster.frames[chunk.rows[:, 2]], begins - begins[0], moved, leverage
 
-    scores (2 n_obs, n): what a unit of each row's error does; rhs (2 n_obs,): the errors.
-    By frame plus by track less what both count, and never less than either alone.
-    """
-    moved = (scores * rhs[:, None]).reshape(len(seen), 2, -1).sum(1)
-    both = seen.frame * (int(seen.point.max()) + 1) + seen.point  # cameras of a frame see it too
-    by_frame, by_track, by_both = (
-        _sum_of_squares(moved, np.unique(cluster, return_inverse=True)[1])
-        for cluster in (seen.frame, seen.point, both)
-    )
-    return np.maximum(by_frame + by_track - by_both, np.maximum(by_frame, by_track))
+
+class ClusterSums:
+    """How far the errors of each frame, each track, and each frame of a track move n unknowns."""
+
+    def __init__(self, n_frames: int, n: int) -> None:
+        self.by_frame = np.zeros((n_frames, n))
+        self.by_track, self.by_both = np.zeros(n), np.zeros(n)  # sums of squares
+        self.n_tracks = self.n_both = 0
+
+    def add(self, moved: FloatArray, frame: IntArray, begins: IntArray) -> None:
+        """Observations in the order of their tracks, which begin at `begins`, then of frames."""
+        np.add.at(self.by_frame, frame, moved)
+        starts_track = np.zeros(len(moved), dtype=bool)
+        starts_track[begins] = True
+        both = np.flatnonzero(starts_track | (np.diff(frame, prepend=-1) != 0))
+        self.by_track += (np.add.reduceat(moved, begins) ** 2).sum(0)
+        self.by_both += (np.add.reduceat(moved, both) ** 2).sum(0)
+        self.n_tracks += len(begins)
+        self.n_both += len(both)
+
+    def merge(self, other: ClusterSums) -> None:
+        """Add what other tracks moved."""
+        self.by_frame += other.by_frame
+        self.by_track += other.by_track
+        self.by_both += other.by_both
+        self.n_tracks += other.n_tracks
+        self.n_both += other.n_both
+
+    def variance(self) -> FloatArray:
+        """Variances (n,), each count n of clusters corrected by n / (n - 1)."""
+        by_frame = (self.by_frame**2).sum(0) * _spread(len(self.by_frame))
+        by_track = self.by_track * _spread(self.n_tracks)
+        by_both = self.by_both * _spread(self.n_both)
+        return np.maximum(by_frame + by_track - by_both, np.maximum(by_frame, by_track))
 
 
-def _sum_of_squares(moved: FloatArray, cluster: IntArray) -> FloatArray:
-    """Sum over clusters of the square of what each cluster's errors do together (n,)."""
-    n_clusters = int(cluster.max()) + 1
-    together = np.zeros((n_clusters, moved.shape[1]))
-    np.add.at(together, cluster, moved)
-    return (together**2).sum(0) * (n_clusters / max(n_clusters - 1, 1))
+def _spread(count: int) -> float:
+    return count / max(count - 1, 1)
 
 
 def _widen(model: FloatArray, variance: FloatArray) -> FloatArray:
@@ -216,28 +221,25 @@ def _widen(model: FloatArray, variance: FloatArray) -> FloatArray:
     return model * factor[:, None] * factor[None, :]
 
 
-def _calibration_columns(
-    graph: CalibrationGraph, estimate: Estimate, first_column: dict[int, int]
+def calibration_columns(
+    graph: CalibrationGraph, estimate: Estimate
 ) -> tuple[IntArray, tuple[str, ...], FloatArray]:
     """Columns of the free lens parameters and cam_from_rig, their names, and the Jacobian
     from GTSAM's tangent to the reported parameters."""
+    layout = graph.layout
     columns: list[int] = []
     names: list[str] = []
     blocks: list[FloatArray] = []
     for index, camera in enumerate(estimate.cameras):
-        start = first_column[lens_key(index)]
-        free = graph.lens_priors[index].free
-        slots = [slot for slot, is_free in zip(native_slots(camera), free, strict=True) if is_free]
-        columns += [start + slot for slot in slots]
-        names += [
-            f"{camera.name}.{p}" for p, is_free in zip(camera.names, free, strict=True) if is_free
-        ]
-        blocks.append(np.eye(len(slots)))
+        lens = layout.lens_of[index]
+        free = np.flatnonzero(graph.lens_priors[lens].free)
+        columns += layout.columns(lens_key(lens))[free].tolist()
+        names += [f"{camera.name}.{camera.names[i]}" for i in free]
+        blocks.append(np.eye(len(free)))
     for index, camera in enumerate(estimate.cameras):
         if index == graph.problem.reference:
             continue
-        start = first_column[rig_key(index)]
-        columns += range(start, start + 6)
+        columns += layout.columns(rig_key(index)).tolist()
         names += [f"{camera.name}.{name}" for name in POSE_NAMES]
         blocks.append(reported_from_tangent(estimate.cam_from_rig[index]))
     return np.array(columns), tuple(names), scipy.linalg.block_diag(*blocks)

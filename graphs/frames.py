@@ -1,8 +1,8 @@
 """Rigid transforms named `a_from_b`, and the border to GTSAM's opposite convention.
 
 `cam_from_world = cam_from_rig @ rig_from_world`: neighbouring frames cancel. Quaternions are
-wxyz. GTSAM stores `world_from_x` and perturbs on the right, rotation first; nothing outside
-this module has to know.
+wxyz. GTSAM stores `world_from_x` and perturbs on the right, rotation first; only the rows of the
+track factor (`graphs.rows`) and the twists of `graphs.pose_covariance` have to know besides.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+# "Smart" noise models turn sigmas below 1e-8 into hard constraints, on which GTSAM's LM is stuck.
+NOT_SMART = False
 
 
 @dataclass(frozen=True)

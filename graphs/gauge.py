@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from graphs.frames import Transform, to_gtsam_inverse
-from graphs.keys import frame_key, rig_key
-from graphs.problem import KnownBaseline, Problem
-from graphs.reference import NOT_SMART
+from graphs.elimination import NotPositiveDefiniteError
+from graphs.frames import NOT_SMART, Transform, to_gtsam_inverse
+from graphs.keys import frame_key, lens_key, rig_key
+from graphs.problem import Problem
+from graphs.system import Layout, System
 
 GAUGE_SIGMA = 1e-6  # of the scene's size, and in radians: far below any estimated sigma
 
@@ -45,7 +46,10 @@ def choose_gauge(problem: Problem) -> Gauge:
 
 
 def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
-    """Hold seven degrees of freedom and the reference camera; a scale source replaces the size."""
+    """Hold seven degrees of freedom and the reference camera.
+
+    With a scale source, whose factor `graphs.scale` makes, only six: the size is not held.
+    """
     gauge = choose_gauge(problem)
     sigma = GAUGE_SIGMA * gauge.distance
     held = gtsam.noiseModel.Diagonal.Sigmas(np.array([GAUGE_SIGMA] * 3 + [sigma] * 3), NOT_SMART)
@@ -54,7 +58,6 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     identity = to_gtsam_inverse(Transform.identity())
     graph.add(gtsam.PriorFactorPose3(rig_key(problem.reference), identity, held))
     if problem.scale is not None:
-        add_known_baseline(graph, problem.scale)
         return
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
     pair = gauge.frames or gauge.cameras
@@ -63,8 +66,42 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     graph.add(gtsam.RangeFactorPose3(key(pair[0]), key(pair[1]), gauge.distance, noise))
 
 
-def add_known_baseline(graph: gtsam.NonlinearFactorGraph, scale: KnownBaseline) -> None:
-    """A measured distance between two cameras, with the sigma of its measurement."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, scale.sigma_m)
-    keys = (rig_key(scale.cameras[0]), rig_key(scale.cameras[1]))
-    graph.add(gtsam.RangeFactorPose3(*keys, scale.length_m, noise))
+def undetermined(problem: Problem, layout: Layout, system: System) -> str | None:
+    """One line on what nothing in the system determines: the variables and the remedy.
+
+    With the gauge held, theory leaves no direction of zero curvature; None: there is none.
+    """
+    start = layout.elimination.n_columns - layout.elimination.border
+    try:
+        directions = system.null_directions()
+    except NotPositiveDefiniteError as error:
+        return f"the scan does not determine {_name(problem, layout, error.column)}: {REMEDY}"
+    if directions.shape[1] == 0:
+        return None
+    largest = np.abs(directions).max(1)
+    involved = start + np.flatnonzero(largest > INVOLVED * largest.max())
+    names = list(dict.fromkeys(_name(problem, layout, int(column)) for column in involved))
+    free = directions.shape[1]
+    return (
+        f"the scan leaves {free} {'direction' if free == 1 else 'directions'} of "
+        f"{', '.join(names)} undetermined: {REMEDY}"
+    )
+
+
+INVOLVED = 0.1  # of the largest share that a variable has in a direction
+REMEDY = "take more views, moving sideways and turning, or hold it at a value"
+
+
+def _name(problem: Problem, layout: Layout, column: int) -> str:
+    """A column of the system in words."""
+    key, part = layout.variable_at(column)
+    kind = "rotation" if part < 3 else "position"
+    for index, camera in enumerate(problem.initial.cameras):
+        if key == lens_key(index):
+            return f"{camera.name}.{camera.names[part]}"
+        if key == rig_key(index):
+            return f"the {kind} of {camera.name} in the rig"
+    for index, name in enumerate(problem.frame_names):
+        if key == frame_key(index):
+            return f"the {kind} of frame {name}"
+    return str(gtsam.DefaultKeyFormatter(key))

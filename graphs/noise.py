@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from graphs.build import GraphOptions
 from graphs.frames import FloatArray
-from graphs.problem import Problem
+from graphs.losses import weight_and_slope
+from graphs.problem import KnownSpan, Problem
 
 # Median of the norm of a 2-D Gaussian of unit sigma (Rayleigh): sqrt(2 ln 2).
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
+# Perfect data has no noise; weights need a scale above rounding.
+SMALLEST_SIGMA_PX = 1e-3
 
 
 def free_dimensions(problem: Problem) -> int:
@@ -32,10 +36,33 @@ def redundancy(problem: Problem) -> float:
 def robust_sigma_px(problem: Problem, residuals: FloatArray) -> float:
     """Sigma of one pixel coordinate from residuals (n_obs, 2), by their median length.
 
-    Half of the observations may be wild. Fitting shrinks residuals; the redundancy undoes it.
+    Of an observation whose relative sigma is 1. Half of the observations may be wild. Fitting
+    shrinks residuals; the redundancy undoes it.
     """
-    norms = np.linalg.norm(residuals[np.isfinite(residuals).all(1)], axis=1)
-    return float(np.median(norms) / RAYLEIGH_MEDIAN / np.sqrt(redundancy(problem)))
+    lengths = residual_lengths(problem, residuals)
+    median = float(np.median(lengths[np.isfinite(lengths)]))
+    return float(median / RAYLEIGH_MEDIAN / np.sqrt(redundancy(problem)))
+
+
+def residual_lengths(problem: Problem, residuals: FloatArray) -> FloatArray:
+    """Lengths (n_obs,) of residuals (n_obs, 2) in px, over their relative sigmas."""
+    relative = problem.observations.relative_sigma
+    lengths: FloatArray = np.linalg.norm(residuals, axis=1)
+    return lengths if relative is None else lengths / relative
+
+
+def with_click_sigma(problem: Problem, sigma_px: float) -> Problem:
+    """The problem with the ends of a KnownSpan weighed by the sigma that is stated of them.
+
+    sigma_px: of all other observations. Where it is larger it holds for clicks too: what it is
+    made of, such as a lens that does not fit, spares none of them.
+    """
+    scale, seen = problem.scale, problem.observations
+    if not isinstance(scale, KnownSpan) or scale.click_sigma_px is None:
+        return problem
+    relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma.copy()
+    relative[np.isin(seen.point, scale.points)] = max(scale.click_sigma_px / sigma_px, 1.0)
+    return replace(problem, observations=replace(seen, relative_sigma=relative))
 
 
 @dataclass(frozen=True)
@@ -53,8 +80,9 @@ class LossMoments:
 
 def loss_moments(problem: Problem, options: GraphOptions, residuals: FloatArray) -> LossMoments:
     """Curvature and score variance of the loss at the residuals (n_obs, 2) of the optimum."""
-    r = np.linalg.norm(residuals[np.isfinite(residuals).all(1)], axis=1) / options.sigma_px
-    weight, slope = loss_weight_and_slope(options, r)
+    lengths = residual_lengths(problem, residuals)
+    r = lengths[np.isfinite(lengths)] / options.sigma_px
+    weight, slope = weight_and_slope(options.loss, options.loss_scale, r)
     mean, apart = (slope + weight) / 2, (slope - weight) / 2  # curvature along and across
     curvature = float(np.mean(mean))
     scatter = float(np.mean(mean**2 + apart**2 / 2)) - curvature**2
@@ -64,13 +92,48 @@ def loss_moments(problem: Problem, options: GraphOptions, residuals: FloatArray)
     return LossMoments(curvature / used, refit * score / used, refit)
 
 
-def loss_weight_and_slope(options: GraphOptions, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """psi(r) / r and psi'(r) of the loss for whitened residual lengths r (n,)."""
-    k = options.loss_scale
-    if options.loss == "cauchy":
-        weight = 1 / (1 + (r / k) ** 2)
-        return weight, weight**2 * (1 - (r / k) ** 2)
-    if options.loss == "huber":
-        inside = r <= k
-        return np.where(inside, 1.0, k / np.maximum(r, k)), np.where(inside, 1.0, 0.0)
-    return np.ones_like(r), np.ones_like(r)
+MOST_FREEDOM = 100.0  # a Student t of so many degrees of freedom is a Gaussian
+LEAST_FREEDOM = 1.0  # below Cauchy's own distribution no mean exists
+
+
+def student_t(lengths: FloatArray, iterations: int = 100) -> tuple[float, float]:
+    """Scale and degrees of freedom of the bivariate Student t that residuals suit best.
+
+    lengths (n,): of residuals, in any unit. Maximum likelihood by expectation-maximisation
+    (Lange, Little and Taylor, JASA 1989). Its negative logarithm is a Cauchy loss of scale
+    sqrt(freedom + 2) on residuals in units of `scale` sqrt(freedom / (freedom + 2)).
+    """
+    s = lengths[np.isfinite(lengths)] ** 2
+    scale2, freedom = float(np.median(s)) / RAYLEIGH_MEDIAN**2, 4.0
+    for _ in range(iterations):
+        before = scale2, freedom
+        weight = (freedom + 2) / (freedom + s / scale2)
+        scale2 = max(float(np.mean(weight * s)) / 2, 1e-300)
+        freedom = _freedom(s / scale2)
+        if np.allclose(before, (scale2, freedom), rtol=1e-6, atol=0):
+            break
+    return scale2**0.5, freedom
+
+
+def _freedom(s: FloatArray) -> float:
+    """Degrees of freedom that make squared lengths, in units of the scale, most likely."""
+
+    def unlikely(log_freedom: float) -> float:
+        # of the bivariate t the constant is 1 / (2 pi), whatever its freedom
+        freedom = np.exp(log_freedom)
+        return float((freedom + 2) / 2 * np.mean(np.log1p(s / freedom)))
+
+    bounds = (np.log(LEAST_FREEDOM), np.log(MOST_FREEDOM))
+    return float(np.exp(minimize_scalar(unlikely, bounds=bounds, method="bounded").x))
+
+
+def adapted(problem: Problem, options: GraphOptions, residuals: FloatArray) -> GraphOptions:
+    """Options with the noise and loss of the Student t that residuals (n_obs, 2) suit best."""
+    scale, freedom = student_t(residual_lengths(problem, residuals))
+    scale /= redundancy(problem) ** 0.5
+    return replace(
+        options,
+        sigma_px=max(scale * (freedom / (freedom + 2)) ** 0.5, SMALLEST_SIGMA_PX),
+        loss="cauchy",
+        loss_scale=(freedom + 2) ** 0.5,
+    )

@@ -8,15 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graphs.camera import Camera, nominal_params
 from graphs.frames import FloatArray, Transform
-from graphs.lenses import Camera, nominal_params
 
 # Real lenses sit a few per cent of the width off the image centre (corridor webcam: 6 %).
 # A free principal point drifts by 39 px on forward motion; 3 % of the width holds it.
 PRINCIPAL_POINT_SIGMA = 0.03  # of the image width
 FOCAL_SIGMA = 1.0  # of the focal length: no knowledge
 ASPECT_SIGMA = 0.005  # of fy / fx about 1: pixels are square to a fraction of a per cent
-DISTORTION_SIGMA = {"k1": 1.0, "k2": 1.0, "k3": 1.0, "k4": 1.0, "p1": 1e-3, "p2": 1e-3}
+# Square exactly: 1e-4 px of a focal length of 1000. Below it the focal length's own information,
+# 1e14 times less, is lost in rounding.
+SQUARE_SIGMA = 1e-7
+# Radial terms of any lens at a radius of one, where they would double or undo the radius. A real
+# k4 to k6 can be larger, but only with k1 to k3 as large, which cancel them: N / D with small ones
+# does as well. Tangential and prism terms are elements out of place, p2 = 0.003 in webcams; they
+# look like the principal point, which wanders off by 13 px where they are free. EuRoC's and TUM
+# VI's lenses have alpha 0.57 to 0.63, beta 1.04 to 1.13, xi -0.17 to -0.24: well within a sigma.
+DISTORTION_SIGMA = {
+    **dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6"), 1.0),
+    **dict.fromkeys(("p1", "p2", "s1", "s2", "s3", "s4"), 1e-3),
+    **dict.fromkeys(("alpha", "beta", "xi"), 0.5),
+}
 PINNED_SIGMA = 1e-9  # a parameter that is held fixed
 
 
@@ -42,9 +54,8 @@ class LensPrior:
         information = np.diag(self.sigma**-2.0)
         if np.isfinite(self.aspect_sigma):
             # fy - fx = 0 within aspect_sigma * f
-            information[:2, :2] += (
-                np.array([[1.0, -1.0], [-1.0, 1.0]]) / (self.aspect_sigma * self.mean[0]) ** 2
-            )
+            sigma_px = max(self.aspect_sigma, SQUARE_SIGMA) * self.mean[0]
+            information[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / sigma_px**2
         return information
 
 
@@ -65,6 +76,7 @@ def weak_lens_prior(
     """What is believed of any lens before its first image, centred on an ideal one."""
     width, focal = camera.size[0], float(camera.params[:2].mean())
     mean = nominal_params(camera.lens, camera.size, focal)
+    mean[:2] = focal
     sigma = np.array(
         [FOCAL_SIGMA * focal] * 2
         + [principal_point_sigma * width] * 2

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graphs.camera import Camera, project
 from graphs.frames import FloatArray, Transform
-from graphs.lenses import Camera, project
 
 IntArray = NDArray[np.int64]
 
@@ -21,13 +21,15 @@ class Observations:
     frame: IntArray  # (n_obs,) index into Problem.frame_names
     camera: IntArray  # (n_obs,) index into Estimate.cameras
     point: IntArray  # (n_obs,) index into Estimate.points
+    relative_sigma: FloatArray | None = None  # (n_obs,) of each pixel's noise; None: all the same
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def subset(self, keep: NDArray[np.bool_]) -> Observations:
+        sigma = None if self.relative_sigma is None else self.relative_sigma[keep]
         return Observations(
-            self.pixels[keep], self.frame[keep], self.camera[keep], self.point[keep]
+            self.pixels[keep], self.frame[keep], self.camera[keep], self.point[keep], sigma
         )
 
 
@@ -60,6 +62,28 @@ class KnownBaseline:
 
 
 @dataclass(frozen=True)
+class KnownPath:
+    """A measured distance between the rig's places at two frames."""
+
+    frames: tuple[int, int]
+    length_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class KnownSpan:
+    """A measured distance between two scene points."""
+
+    points: tuple[int, int]
+    length_m: float
+    sigma_m: float
+    click_sigma_px: float | None = None  # of the ends' pixels; None: as noisy as all others
+
+
+ScaleSource = KnownBaseline | KnownPath | KnownSpan
+
+
+@dataclass(frozen=True)
 class Problem:
     """Everything the graph needs: observations, and where to start."""
 
@@ -67,7 +91,7 @@ class Problem:
     observations: Observations
     frame_names: tuple[str, ...]
     reference: int = 0  # index of the camera whose frame is the rig's frame
-    scale: KnownBaseline | None = None
+    scale: ScaleSource | None = None
 
 
 def points_in_cameras(estimate: Estimate, observations: Observations) -> FloatArray:

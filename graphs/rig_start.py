@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform, median_rotation
-from graphs.lenses import Camera
 from graphs.problem import Estimate, IntArray, Observations, Problem, residuals_px
 
 # A wrong pose sends nearly all observations of its image astray, a merely inexact rig only some.

@@ -6,10 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
-from graphs.problem import Estimate, IntArray, Observations, Problem
+from graphs.problem import (
+    Estimate,
+    IntArray,
+    KnownPath,
+    KnownSpan,
+    Observations,
+    Problem,
+    ScaleSource,
+)
 
 MIN_TRACK_LENGTH = 3  # two views of a point cannot show that one is wrong
 
@@ -30,61 +37,11 @@ def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
     return compact(problem, seen.subset(keep[seen.point]))
 
 
-GRID = 8  # cells a side over which an image's observations are spread
-
-
-def within_budget(problem: Problem, max_observations: int) -> Problem:
-    """The problem with the tracks that say most, at most `max_observations` of them together.
-
-    Long tracks first, as long as they fall into a part of some image that still lacks
-    observations; then long tracks anywhere. Random order breaks no ties: the result is the same
-    every time.
-    """
-    seen = problem.observations
-    if len(seen) <= max_observations:
-        return problem
-    size = np.array([camera.size for camera in problem.initial.cameras])[seen.camera]
-    cell = np.clip((seen.pixels / size * GRID).astype(np.int64), 0, GRID - 1)
-    image = seen.frame * len(problem.initial.cameras) + seen.camera
-    place = (image * GRID + cell[:, 1]) * GRID + cell[:, 0]
-    quota = max(max_observations // (len(np.unique(image)) * GRID * GRID), 1)
-    order = np.argsort(seen.point, kind="stable")
-    length = np.bincount(seen.point, minlength=len(problem.initial.points))
-    by_length = np.argsort(-length, kind="stable")
-    begins = np.cumsum(length) - length
-    keep = _spread(place[order], begins, length, by_length, quota, max_observations)
-    return compact(problem, seen.subset(keep[seen.point]))
-
-
-@njit(cache=True)
-def _spread(
-    place: IntArray,
-    begins: IntArray,
-    length: IntArray,
-    order: IntArray,
-    quota: int,
-    budget: int,
-) -> NDArray[np.bool_]:
-    filled = np.zeros(place.max() + 1, np.int64)
-    keep = np.zeros(len(length), np.bool_)
-    total = 0
-    for lacking_only in (True, False):
-        for point in order:
-            n = length[point]
-            if keep[point] or n == 0 or total + n > budget:
-                continue
-            cells = place[begins[point] : begins[point] + n]
-            if lacking_only and np.sum(filled[cells] < quota) * 2 < n:
-                continue
-            keep[point] = True
-            total += n
-            for cell in cells:
-                filled[cell] += 1
-    return keep
-
-
 def compact(problem: Problem, observations: Observations) -> Problem:
-    """The problem with these observations, and only the frames and points they see."""
+    """The problem with these observations, and only the frames and points they see.
+
+    Raises ValueError when an end of the measured distance goes with the rest.
+    """
     start = problem.initial
     points, point = np.unique(observations.point, return_inverse=True)
     frames, frame = np.unique(observations.frame, return_inverse=True)
@@ -98,7 +55,32 @@ def compact(problem: Problem, observations: Observations) -> Problem:
         ),
         observations=replace(observations, point=point, frame=frame),
         frame_names=tuple(problem.frame_names[f] for f in frames),
+        scale=_renumbered(problem, frames, points),
     )
+
+
+def _renumbered(problem: Problem, frames: IntArray, points: IntArray) -> ScaleSource | None:
+    """The problem's scale source once only these frames and points are left."""
+    scale = problem.scale
+    if isinstance(scale, KnownPath):
+        if not np.isin(scale.frames, frames).all():
+            names = " and ".join(problem.frame_names[f] for f in scale.frames)
+            raise ValueError(
+                f"the distance of {scale.length_m:g} m between the frames {names} cannot be used: "
+                "too few points of one of them are consistent; measure between other frames"
+            )
+        first, second = np.searchsorted(frames, scale.frames).tolist()
+        return replace(scale, frames=(first, second))
+    if isinstance(scale, KnownSpan):
+        if not np.isin(scale.points, points).all():
+            raise ValueError(
+                f"the distance of {scale.length_m:g} m between two points cannot be used: one is "
+                f"seen fewer than {MIN_TRACK_LENGTH} times consistently, or almost without "
+                "parallax; measure between other points"
+            )
+        first, second = np.searchsorted(points, scale.points).tolist()
+        return replace(scale, points=(first, second))
+    return scale
 
 
 def parallax_deg(problem: Problem) -> FloatArray:

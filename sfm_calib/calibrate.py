@@ -10,6 +10,7 @@ from pathlib import Path
 
 from graphs.build import GraphOptions
 from graphs.covariance import CalibrationCovariance, calibration_covariance
+from graphs.losses import SCALE_95, LossName
 from graphs.problem import Problem
 from graphs.refine import Refinement, refine
 from sfm_calib.cache import Cache
@@ -23,6 +24,7 @@ from sfm_calib.nominal import (
     lens_of,
     lens_priors,
     rig_priors,
+    shared_lenses,
     start_from_config,
 )
 from sfm_calib.result import Calibration
@@ -80,10 +82,14 @@ def calibrate(
 
 def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Refinement:
     """The graph's optimum under the configuration's priors."""
+    adaptive = config.loss == "adaptive"
+    loss: LossName = "cauchy" if config.loss == "adaptive" else config.loss
     options = GraphOptions(
-        loss=config.loss,
+        loss=loss,
+        loss_scale=SCALE_95[loss],
         lens_priors=lens_priors(problem.initial, config),
         rig_priors=rig_priors(problem.initial, config, problem.reference),
+        shared_lenses=shared_lenses(problem, config),
     )
     try:
         return refine(
@@ -92,6 +98,7 @@ def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Re
             config.min_parallax_deg,
             config.max_observations,
             on_iteration=lambda iteration, cost: progress("solving", iteration, 0),
+            adaptive=adaptive,
         )
     except ValueError as error:
         raise CalibrationError(str(error)) from error

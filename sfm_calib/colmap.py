@@ -18,10 +18,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from graphs.camera import Camera, nominal_params
 from graphs.frames import Transform
-from graphs.lenses import PARAMETER_NAMES, Camera, LensName, nominal_params
+from graphs.lenses import LensName
 from graphs.problem import Observations
 from graphs.rig_start import FreeModel
+from sfm_calib.colmap_lenses import LENS_OF_MODEL, MAPPING_MODEL, in_model, out_of_model
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan
 from sfm_calib.pairs import Pair
@@ -37,22 +39,6 @@ DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
 # COLMAP's names of its parameters, where they are not ours.
 PARAMETER_ALIASES = {"k": "k1"}
-# One focal length while mapping: with two, OPENCV on a corridor ends at fx 777, fy 208 px.
-MAPPING_MODEL: dict[LensName, str] = {
-    "pinhole": "SIMPLE_PINHOLE",
-    "simple_radial": "SIMPLE_RADIAL",
-    "radial": "RADIAL",
-    "radtan": "RADIAL",
-    "kannala_brandt": "RADIAL_FISHEYE",
-}
-# The model that holds every parameter of the lens, to hold our results against COLMAP's.
-EXACT_MODEL: dict[LensName, str] = {
-    "pinhole": "PINHOLE",
-    "simple_radial": "OPENCV",
-    "radial": "OPENCV",
-    "radtan": "OPENCV",
-    "kannala_brandt": "OPENCV_FISHEYE",
-}
 
 
 def quiet(verbose: bool) -> None:
@@ -76,13 +62,14 @@ def _colmap_errors() -> Iterator[None]:
 
 
 def colmap_camera(camera: Camera, model: str, camera_id: int = 1) -> pycolmap.Camera:
-    """A camera in one of COLMAP's models; parameters the model has not are left out."""
+    """A camera in one of COLMAP's models; the nearest one where the model cannot hold it."""
     width, height = camera.size
     result = pycolmap.Camera.create_from_model_name(camera_id, model, 1.0, width, height)
-    ours = camera.named()
-    ours |= {"f": float(camera.params[:2].mean())}
+    names = parameter_names(result)
+    near = in_model(camera, model, names)
+    ours = near.named() | {"f": float(near.params[:2].mean())}
     ours |= {"cx": ours["cx"] + PIXEL_OFFSET, "cy": ours["cy"] + PIXEL_OFFSET}
-    result.params = [ours.get(name, 0.0) for name in parameter_names(result)]
+    result.params = [ours[name] for name in names]
     return result
 
 
@@ -93,13 +80,12 @@ def parameter_names(camera: pycolmap.Camera) -> list[str]:
 
 
 def camera_from_colmap(name: str, lens: LensName, camera: pycolmap.Camera) -> Camera:
-    """A camera with the parameters that COLMAP found; those its model has not are zero."""
+    """A camera with the parameters that COLMAP found; those its model has not are nominal."""
     found = dict(zip(parameter_names(camera), camera.params.tolist(), strict=True))
     if "f" in found:
         found |= {"fx": found["f"], "fy": found["f"]}
     found |= {"cx": found["cx"] - PIXEL_OFFSET, "cy": found["cy"] - PIXEL_OFFSET}
-    params = np.array([found.get(p, 0.0) for p in PARAMETER_NAMES[lens]])
-    return Camera(name, lens, (camera.width, camera.height), params)
+    return out_of_model(name, (camera.width, camera.height), camera.model.name, found, lens)
 
 
 def extract_features(
@@ -125,7 +111,7 @@ def extract_features(
         reader.camera_model = MAPPING_MODEL[lenses[index]]
         reader.default_focal_length_factor = DEFAULT_FOCAL
         start = known.get(index)
-        if start is None and lenses[index] == "kannala_brandt":
+        if start is None and LENS_OF_MODEL[reader.camera_model] == "kannala_brandt":
             start = _fisheye_guess(scan, index)
         if start is not None:
             reader.camera_params = ",".join(
@@ -359,10 +345,9 @@ def free_model(
         poses[here.camera, here.frame] = Transform(
             pose.rotation.matrix(), np.ravel(pose.translation)
         )
-        cameras.setdefault(
-            here.camera,
-            camera_from_colmap(scan.cameras[here.camera], lenses[here.camera], found),
-        )
+        if here.camera not in cameras:
+            name, lens = scan.cameras[here.camera], lenses[here.camera]
+            cameras[here.camera] = camera_from_colmap(name, lens, found)
     keypoints = {i: np.array([p.xy for p in image.points2D]) for i, image in images.items()}
     pixels, frames, owners, points, positions = [], [], [], [], []
     for number, point_id in enumerate(sorted(reconstruction.points3D)):

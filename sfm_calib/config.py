@@ -10,11 +10,19 @@ from typing import Annotated, Literal
 
 import tyro
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from graphs.build import LossName
 from graphs.lenses import LensName
+from graphs.losses import LossChoice
 from graphs.refine import MAX_OBSERVATIONS
+from graphs.selection import MIN_TRACK_LENGTH
 from sfm_calib.errors import CalibrationError
 
 RIG_FILE = "rig.yaml"
@@ -38,12 +46,12 @@ class Options(BaseModel):
     """SIFT features an image, at most: 100 to 50000."""
     video_frames: Annotated[int, Field(ge=3, le=2000)] = 80
     """Frames picked from a video, at most: 3 to 2000."""
-    loss: LossName = "cauchy"
-    """Robust loss on feature observations."""
+    loss: LossChoice = "cauchy"
+    """Robust loss on feature observations; adaptive: its shape estimated from the residuals."""
     min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
     """Points seen under a smaller angle are left out: they say little and harm the solve."""
     max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS
-    """Observations in the graph, at most: the longest tracks, spread over the images."""
+    """Observations in the graph, at most: the tracks that say most, spread over the images."""
     principal_point_sigma: Annotated[float, Field(gt=0, le=10)] = 0.03
     """Belief that the principal point is near the image centre: sigma in image widths."""
     aspect_sigma: Annotated[float, Field(gt=0, le=10)] = 0.005
@@ -60,7 +68,7 @@ class CameraConfig(BaseModel):
     lens: LensName | None = None
     params: dict[str, float] = {}  # where to start, and the mean of the prior
     sigma: dict[str, Annotated[float, Field(gt=0)]] = {}  # sigma of the prior on params
-    fixed: tuple[str, ...] = ()  # held at params, else at 0 and the image centre
+    fixed: tuple[str, ...] = ()  # held at params, else nominal: 0, the image centre
     cam_from_rig: CamFromRigConfig | None = None
 
     @field_validator("params")
@@ -103,18 +111,83 @@ class BaselineConfig(BaseModel):
     sigma_m: Annotated[float, Field(gt=0)]
 
 
+class FramesConfig(BaseModel):
+    """A measured distance between the reference camera's places at two frames."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    between: tuple[str, str]
+    length_m: Annotated[float, Field(gt=0)]
+    sigma_m: Annotated[float, Field(gt=0)]
+
+
+class ClickConfig(BaseModel):
+    """Where a mark was seen in one image."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    camera: str
+    frame: str
+    pixel: tuple[float, float]  # the centre of the top-left pixel is (0, 0)
+
+
+class PointsConfig(BaseModel):
+    """A measured distance between two marks in the scene, each clicked in several images."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    between: tuple[tuple[ClickConfig, ...], tuple[ClickConfig, ...]]
+    length_m: Annotated[float, Field(gt=0)]
+    sigma_m: Annotated[float, Field(gt=0)]
+    click_sigma_px: Annotated[float, Field(gt=0, le=100)] = 1.0  # of each coordinate
+
+    @field_validator("between")
+    @classmethod
+    def _marks_are_clicked_often_enough(
+        cls, marks: tuple[tuple[ClickConfig, ...], tuple[ClickConfig, ...]]
+    ) -> tuple[tuple[ClickConfig, ...], tuple[ClickConfig, ...]]:
+        for which, clicks in zip(("first", "second"), marks, strict=True):
+            if len(clicks) < MIN_TRACK_LENGTH:
+                raise ValueError(
+                    f"the {which} mark has {len(clicks)} clicks and needs {MIN_TRACK_LENGTH}: "
+                    "click it in more images, taken from different places"
+                )
+        return marks
+
+
+Measured = BaselineConfig | FramesConfig | PointsConfig
+
+
 class ScaleConfig(BaseModel):
-    """What gives the rig's lengths in metres."""
+    """What gives the rig's lengths in metres: one measured distance at most."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     baseline: BaselineConfig | None = None
+    frames: FramesConfig | None = None
+    points: PointsConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ScaleConfig:
+        given = [name for name in ScaleConfig.model_fields if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(
+                f"{len(given)} sources ({' and '.join(given)}) and one unit of length: keep the "
+                "distance that you measured best"
+            )
+        return self
+
+    @property
+    def measured(self) -> Measured | None:
+        """The one distance that is given."""
+        return self.baseline or self.frames or self.points
 
 
 class RigConfig(Options):
     """Everything rig.yaml may hold: the options, and what is known of the rig."""
 
     cameras: dict[str, CameraConfig] = {}
+    shared_lenses: tuple[tuple[str, ...], ...] = ()  # groups of cameras with one and the same lens
     scale: ScaleConfig = ScaleConfig()
 
     def options(self) -> Options:
@@ -177,10 +250,10 @@ def first_problem(error: ValidationError, spell: Callable[[str], str] = str) -> 
         close = difflib.get_close_matches(str(problem["loc"][-1]), names, n=1, cutoff=0.0)
         hint = f"did you mean {close[0]!r}? " if close else ""
         return f"unknown key {where!r}: {hint}Valid here: {', '.join(names)}"
-    if "[key]" in problem["loc"]:
-        key = problem["input"]
-        return f"{where}: the name {key!r} is a {type(key).__name__}; put it in quotes"
     value = problem["input"]
+    is_number = isinstance(value, int | float)
+    if "[key]" in problem["loc"] or (problem["type"] == "string_type" and is_number):
+        return f"{where}: the name {value!r} is a {type(value).__name__}; put it in quotes"
     message = problem["msg"].removeprefix("Value error, ")
     shown = f" (got {value!r})" if isinstance(value, str | int | float | bool) else ""
     return f"{where}: {message}{shown}"
@@ -191,7 +264,12 @@ def _valid_names(location: tuple[str | int, ...]) -> list[str]:
     if location[:1] == ("cameras",):
         model = CamFromRigConfig if "cam_from_rig" in location[:-1] else CameraConfig
     elif location[:1] == ("scale",):
-        model = BaselineConfig if "baseline" in location[:-1] else ScaleConfig
+        sources: dict[int | str, type[BaseModel]] = {
+            "baseline": BaselineConfig,
+            "frames": FramesConfig,
+            "points": ClickConfig if "between" in location[:-1] else PointsConfig,
+        }
+        model = sources[location[1]] if len(location) > 2 else ScaleConfig
     return sorted(model.model_fields)
 
 

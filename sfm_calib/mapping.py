@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from graphs.camera import Camera
 from graphs.frames import Transform
 from graphs.join import join_models
-from graphs.lenses import Camera, LensName
+from graphs.lenses import LensName
 from graphs.problem import Problem
 from graphs.rig_start import FreeModel, impose_rig, link_cameras
 from sfm_calib import colmap

@@ -1,20 +1,21 @@
-"""What rig.yaml knows of the rig, in the words of the maths: starts, priors, scale."""
+"""What rig.yaml knows of the rig, in the words of the maths: starts and priors."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from graphs.camera import Camera, nominal_params
 from graphs.frames import Transform
-from graphs.lenses import PARAMETER_NAMES, Camera, LensName, nominal_params
+from graphs.lenses import PARAMETER_NAMES, LensName
 from graphs.priors import LensPrior, RigPrior, stated_lens_prior, weak_lens_prior
-from graphs.problem import Estimate, KnownBaseline, Problem
+from graphs.problem import Estimate, Problem
 from sfm_calib.config import CameraConfig, RigConfig
-from sfm_calib.errors import CalibrationError
+from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.images import Scan
+from sfm_calib.scale import check_scale, with_scale
 
 
 def camera_config(config: RigConfig, name: str) -> CameraConfig:
@@ -40,15 +41,13 @@ def lens_of(config: RigConfig, name: str, n_cameras: int) -> LensName:
 
 
 def check_config(config: RigConfig, scan: Scan) -> None:
-    """Raises CalibrationError where rig.yaml names a camera or a parameter that does not exist."""
+    """Raises CalibrationError where rig.yaml names what the scan or a lens does not have."""
     named = [("cameras", name) for name in config.cameras]
     named += [("reference", config.reference)] if config.reference else []
-    baseline = config.scale.baseline
-    named += [("scale.baseline.cameras", name) for name in baseline.cameras] if baseline else []
     for key, name in named:
         if name not in scan.cameras:
             raise CalibrationError(
-                f"{key}: the scan has no camera {name!r}; {_nearest(name, scan.cameras)}"
+                f"{key}: the scan has no camera {name!r}; {nearest(name, scan.cameras)}"
             )
     for name, entry in config.cameras.items():
         lens = lens_of(config, name, len(scan.cameras))
@@ -57,7 +56,7 @@ def check_config(config: RigConfig, scan: Scan) -> None:
             if parameter not in valid:
                 raise CalibrationError(
                     f"rig.yaml gives camera {name} a parameter {parameter!r} that its lens "
-                    f"{lens} does not have; {_nearest(parameter, valid)}"
+                    f"{lens} does not have; {nearest(parameter, valid)}"
                 )
         for parameter in entry.sigma:
             if parameter not in entry.params:
@@ -70,16 +69,54 @@ def check_config(config: RigConfig, scan: Scan) -> None:
                 f"rig.yaml holds {parameter} of camera {name} without its value: add "
                 f"cameras.{name}.params.{parameter}"
             )
-    if baseline and baseline.cameras[0] == baseline.cameras[1]:
-        raise CalibrationError(
-            f"rig.yaml measures a baseline from {baseline.cameras[0]} to itself; name two cameras"
-        )
+    _check_shared_lenses(config, scan)
+    check_scale(config.scale, scan)
 
 
-def _nearest(name: str, valid: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}it has {', '.join(valid)}"
+def _check_shared_lenses(config: RigConfig, scan: Scan) -> None:
+    """Who shares a lens must have the same model and image size, and share it once."""
+    grouped: list[str] = []
+    for group in config.shared_lenses:
+        for name in group:
+            if name not in scan.cameras:
+                raise CalibrationError(
+                    f"shared_lenses: the scan has no camera {name!r}; {nearest(name, scan.cameras)}"
+                )
+            if name in grouped:
+                raise CalibrationError(f"shared_lenses names {name} twice; put it into one group")
+            grouped.append(name)
+        kinds = {
+            name: (lens_of(config, name, len(scan.cameras)), scan.sizes[scan.cameras.index(name)])
+            for name in group
+        }
+        for name, (lens, size) in kinds.items():
+            if (lens, size) != kinds[group[0]]:
+                first = kinds[group[0]]
+                raise CalibrationError(
+                    f"shared_lenses: {group[0]} ({first[0]}, {first[1][0]} x {first[1][1]} px) and "
+                    f"{name} ({lens}, {size[0]} x {size[1]} px) cannot share one lens; take {name} "
+                    "out of the group"
+                )
+        for name in group[1:]:
+            if _states_lens(camera_config(config, name)):
+                raise CalibrationError(
+                    f"shared_lenses: what is known of the lens of {name} belongs to {group[0]}, "
+                    "the first of its group: move params, sigma and fixed there"
+                )
+
+
+def _states_lens(entry: CameraConfig) -> bool:
+    return bool(entry.params or entry.sigma or entry.fixed)
+
+
+def shared_lenses(problem: Problem, config: RigConfig) -> tuple[tuple[int, ...], ...]:
+    """The groups of cameras with one lens, by index; cameras that the mapping lost are left out."""
+    names = [camera.name for camera in problem.initial.cameras]
+    groups = (
+        tuple(names.index(name) for name in group if name in names)
+        for group in config.shared_lenses
+    )
+    return tuple(group for group in groups if len(group) > 1)
 
 
 def known_cameras(config: RigConfig, scan: Scan) -> dict[int, Camera]:
@@ -91,8 +128,9 @@ def known_cameras(config: RigConfig, scan: Scan) -> dict[int, Camera]:
         if not focals:
             continue
         lens, size = lens_of(config, name, len(scan.cameras)), scan.sizes[index]
-        camera = Camera(name, lens, size, nominal_params(lens, size, float(np.mean(focals))))
-        known[index] = with_params(camera, given)
+        camera = Camera(name, lens, size, nominal_params(lens, size, 1.0))
+        both = dict.fromkeys(("fx", "fy"), float(np.mean(focals)))
+        known[index] = with_params(camera, both | given)
     return known
 
 
@@ -140,7 +178,7 @@ def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, 
     Without a metric scale only the rotation can be believed.
     """
     names = [camera.name for camera in start.cameras]
-    metric = config.scale.baseline is not None
+    metric = config.scale.measured is not None
     priors = {}
     for index, transform in enumerate(nominal_transforms(config, names, reference)):
         said = camera_config(config, names[index]).cam_from_rig
@@ -157,7 +195,7 @@ def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, 
 def start_from_config(problem: Problem, config: RigConfig) -> Problem:
     """The problem with held parameters at their values, in the unit of its scale source.
 
-    Raises CalibrationError when the measured baseline is between cameras at one place.
+    Raises CalibrationError as `with_scale`.
     """
     start = problem.initial
     cameras = tuple(
@@ -165,20 +203,4 @@ def start_from_config(problem: Problem, config: RigConfig) -> Problem:
         for camera, prior in zip(start.cameras, lens_priors(start, config), strict=True)
     )
     problem = replace(problem, initial=replace(start, cameras=cameras))
-    measured = config.scale.baseline
-    if measured is None:
-        return problem
-    names = [camera.name for camera in cameras]
-    pair = (names.index(measured.cameras[0]), names.index(measured.cameras[1]))
-    centres = [start.cam_from_rig[index].inverse.translation for index in pair]
-    length = float(np.linalg.norm(centres[1] - centres[0]))
-    if length <= 0:
-        raise CalibrationError(
-            f"the scan puts {measured.cameras[0]} and {measured.cameras[1]} at one place, and "
-            f"rig.yaml {measured.length_m:g} m apart: give the distance of another pair"
-        )
-    return replace(
-        problem,
-        initial=problem.initial.scaled(measured.length_m / length),
-        scale=KnownBaseline(pair, measured.length_m, measured.sigma_m),
-    )
+    return with_scale(problem, config.scale, config.min_parallax_deg)

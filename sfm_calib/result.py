@@ -9,8 +9,9 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from graphs.camera import Camera
 from graphs.frames import Transform
-from graphs.lenses import PARAMETER_NAMES, Camera, LensName
+from graphs.lenses import PARAMETER_NAMES, LensName
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 
@@ -108,6 +109,18 @@ class Verdict(Record):
     messages: tuple[str, ...] = ()
 
 
+class Selection(Record):
+    """Of more observations than `max_observations`: what was kept, and what leaving the rest costs.
+
+    Sigmas with what was kept over those with all, before the solve, of lenses and rig.
+    """
+
+    available: int
+    kept: int
+    sigma_factor: float  # median
+    worst_sigma_factor: float
+
+
 class Solve(Record):
     """How the optimum was reached, and on what."""
 
@@ -120,6 +133,7 @@ class Solve(Record):
     n_points: int
     n_observations: int
     n_rejected: int = 0  # mismatches, beyond the loss
+    selection: Selection | None = None  # None: all observations were used
     seconds: dict[str, float] = {}
 
 

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
 
 import sfm_calib
+from graphs.budget import Budget
+from graphs.build import root_information
 from graphs.covariance import CalibrationCovariance, Covariance
 from graphs.frames import Transform
-from graphs.problem import residuals_px
+from graphs.problem import KnownSpan, residuals_px
 from graphs.refine import Refinement
-from graphs.scale import baseline_unit, in_unit_baseline
+from graphs.scale import total_sigma_m
+from graphs.unit import baseline_unit, in_unit_baseline
 from sfm_calib import nominal, result
 from sfm_calib.config import RigConfig
 from sfm_calib.images import Scan
 from sfm_calib.mapping import Mapped
+from sfm_calib.scale import in_words
 
 PRIOR_DECIDES = 0.5  # of the prior's variance left: the data have said less than the belief
 FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
@@ -119,10 +123,8 @@ def _rig(
     reference = names[problem.reference]
     scale = result.Scale(source="none: one camera has no length")
     if problem.scale is not None:
-        measured, pair = problem.scale, [names[i] for i in problem.scale.cameras]
         scale = result.Scale(
-            source=f"baseline {pair[0]} to {pair[1]}: {measured.length_m:g} m",
-            sigma_relative=measured.sigma_m / measured.length_m,
+            source=in_words(problem.scale, problem), sigma_relative=_scale_sigma(run)
         )
     elif far is not None:
         scale = result.Scale(source=f"none: unit is the baseline {reference} to {names[far]}")
@@ -134,6 +136,22 @@ def _rig(
         metric=problem.scale is not None,
         scale=scale,
     )
+
+
+def _scale_sigma(run: Run) -> float:
+    """Relative sigma of the measured distance at the optimum, its clicks' own included."""
+    graph = run.refinement.graph
+    scale, options = graph.problem.scale, graph.options
+    assert scale is not None
+    sigma_m = total_sigma_m(
+        graph.problem,
+        root_information(graph.problem, options),
+        graph.layout.lens_of,
+        options.loss,
+        options.loss_scale,
+        run.refinement.values,
+    )
+    return sigma_m / scale.length_m
 
 
 def _verdict(run: Run, cameras: dict[str, result.CameraResult]) -> result.Verdict:
@@ -164,7 +182,7 @@ def _verdict(run: Run, cameras: dict[str, result.CameraResult]) -> result.Verdic
                     f"the sigma of {name}.{parameter} is {relative:.0%} of it (usable up to "
                     f"{USABLE_FOCAL_SIGMA:.0%})"
                 )
-    messages += _contradictions(run)
+    messages += _contradictions(run) + _lost_clicks(run)
     messages = [f"not usable: {reason}" for reason in reasons] + messages
     weak = tuple(_weak_direction(cameras[name], name, parameter) for name, parameter in believed)
     return result.Verdict(usable=not reasons, weak=weak, messages=tuple(messages))
@@ -184,6 +202,21 @@ def _contradictions(run: Run) -> list[str]:
                     f"stated sigmas from {mean:g}: the scan contradicts rig.yaml"
                 )
     return found
+
+
+def _lost_clicks(run: Run) -> list[str]:
+    """Clicks on marks that were set aside as mismatches."""
+    said, problem = run.config.scale.points, run.refinement.problem
+    if said is None or not isinstance(problem.scale, KnownSpan):
+        return []
+    given = sum(map(len, said.between))
+    left = int(np.isin(problem.observations.point, problem.scale.points).sum())
+    if left == given:
+        return []
+    return [
+        f"{given - left} of {given} clicks on the marks of scale.points contradict the others and "
+        "were set aside: look at them again"
+    ]
 
 
 def _weak_direction(entry: result.CameraResult, name: str, parameter: str) -> result.WeakDirection:
@@ -206,8 +239,13 @@ def _solve(run: Run) -> result.Solve:
         n_points=len(refinement.estimate.points),
         n_observations=len(seen),
         n_rejected=refinement.n_rejected,
+        selection=_selection(refinement.budget),
         seconds=run.seconds,
     )
+
+
+def _selection(budget: Budget | None) -> result.Selection | None:
+    return None if budget is None else result.Selection(**asdict(budget))
 
 
 def _provenance(run: Run) -> result.Provenance:

@@ -115,6 +115,12 @@ def print_result(calibration: Calibration, console: Console) -> None:
             f"{solve.n_rejected} mismatches set aside; noise {noise.sigma_px:.2f} px, "
             f"sigmas widened {noise.inflation:.1f} x",
         )
+    if solve and (chosen := solve.selection):
+        _print_line(
+            console,
+            f"{chosen.kept} of {chosen.available} observations chosen (max_observations): sigmas "
+            f"{chosen.sigma_factor:.2f} x those of all, at worst {chosen.worst_sigma_factor:.2f} x",
+        )
     for weak in verdict.weak if verdict else ():
         _print_line(console, f"weak: {weak.what} is decided by its prior; {weak.remedy}")
     for message in verdict.messages if verdict else ():

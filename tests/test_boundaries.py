@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("graphs", "sfm_calib", "experiments")
-MATHS = {"numpy", "scipy", "numba", "gtsam", "gtsam_unstable", "graphs"}
+MATHS = {"numpy", "scipy", "numba", "threadpoolctl", "gtsam", "gtsam_unstable", "graphs"}
 MOST_LINES = 400
 
 

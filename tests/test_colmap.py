@@ -1,14 +1,19 @@
-"""COLMAP's database and models are the same every time, and numbered as the scan is."""
+"""COLMAP's models are the same every time, numbered as the scan is, and hold our lenses."""
 
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
+from synthetic.cameras import camera_of
 from synthetic.scans import simulation
 
-from graphs.lenses import LENS_NAMES, PARAMETER_NAMES, Camera
+from graphs.camera import project, unproject
+from graphs.lenses import LENS_NAMES, PARAMETER_NAMES
 from sfm_calib import colmap
 from sfm_calib.cache import Cache
+from sfm_calib.colmap_lenses import EXACT_MODEL, LENS_OF_MODEL, MAPPING_MODEL
 from sfm_calib.images import read_scan
 
 
@@ -44,14 +49,89 @@ def test_tracks_and_models_are_the_same_every_time(tmp_path):
         np.testing.assert_array_equal(ours.params, others.params)
 
 
+def grid():
+    return np.stack(np.meshgrid(np.linspace(0, 639, 16), np.linspace(0, 479, 12)), axis=-1)
+
+
+def apart_px(camera, other):
+    """How far apart the two put the rays of the first one's pixels."""
+    return np.linalg.norm(project(other, unproject(camera, grid())) - grid(), axis=-1)
+
+
+def square(lens, coefficients=None):
+    """A camera of the lens with one focal length, as while mapping."""
+    camera = camera_of(lens, coefficients)
+    camera.params[1] = camera.params[0]
+    return camera
+
+
+SMALLER = {  # what the mapping model has of the lens
+    "pinhole": (),
+    "simple_radial": (-0.1,),
+    "radial": (-0.1, 0.02),
+    "radtan": (-0.1, 0.02, 0.0, 0.0),
+    "brown": (-0.1, 0.02, 0.0, 0.0, 0.0),
+    "rational": (-0.1, 0.02, *[0.0] * 6),
+    "thin_prism": (-0.1, 0.02, *[0.0] * 10),
+    "kannala_brandt": (-0.03, 0.01, 0.0, 0.0),
+    "division": (-0.17,),
+}
+
+
+@pytest.mark.parametrize("lens", SMALLER)
+def test_what_the_mapping_model_has_survives_the_way_through_colmap(lens):
+    camera = square(lens, SMALLER[lens])
+    there = colmap.colmap_camera(camera, MAPPING_MODEL[lens])
+    back = colmap.camera_from_colmap("cam", lens, there)
+    np.testing.assert_allclose(back.params, camera.params)
+    assert (back.name, back.lens, back.size) == (camera.name, lens, camera.size)
+    assert (there.principal_point_x, there.principal_point_y) == (330.5, 231.5)
+
+
+@pytest.mark.parametrize("lens", EXACT_MODEL)
+def test_the_exact_model_loses_nothing(lens):
+    camera = camera_of(lens)
+    back = colmap.camera_from_colmap("cam", lens, colmap.colmap_camera(camera, EXACT_MODEL[lens]))
+    np.testing.assert_array_equal(back.params, camera.params)
+
+
+def test_tangential_terms_are_left_out_and_the_rest_stays():
+    there = colmap.colmap_camera(square("radtan"), "RADIAL")
+    np.testing.assert_allclose(there.params, [520, 330.5, 231.5, -0.31, 0.11])
+
+
+@pytest.mark.parametrize("lens", ["brown", "rational", "kannala_brandt", "eucm", "double_sphere"])
+def test_what_the_mapping_model_has_not_is_made_up_for(lens):
+    """Left out, k3 to k6 alone would move the corners by many pixels."""
+    camera = square(lens)
+    if "p1" in camera.names:  # left out on purpose
+        camera.params[6:8] = 0
+    back = colmap.camera_from_colmap("cam", lens, colmap.colmap_camera(camera, MAPPING_MODEL[lens]))
+    assert np.sqrt((apart_px(camera, back) ** 2).mean()) < 0.5
+    params = np.where(np.isin(camera.names, ["k3", "k4", "k5", "k6"]), 0, camera.params)
+    shorter = replace(camera, params=params)
+    assert lens in ("eucm", "double_sphere") or np.nanmax(apart_px(camera, shorter)) > 2
+
+
+def test_every_lens_maps_with_one_focal_length():
+    for lens in LENS_NAMES:
+        model = pycolmap.Camera.create_from_model_name(1, MAPPING_MODEL[lens], 500.0, 640, 480)
+        names = colmap.parameter_names(model)
+        assert "f" in names and "fx" not in names
+        known = {"f", *PARAMETER_NAMES[LENS_OF_MODEL[MAPPING_MODEL[lens]]]}
+        assert set(names) <= known
+    for lens, model in EXACT_MODEL.items():
+        exact = pycolmap.Camera.create_from_model_name(1, model, 500.0, 640, 480)
+        assert set(PARAMETER_NAMES[lens]) <= set(colmap.parameter_names(exact))
+
+
 @pytest.mark.parametrize("lens", LENS_NAMES)
-def test_cameras_survive_the_way_through_colmap(lens):
-    names = PARAMETER_NAMES[lens]
-    params = np.array([500.0, 500.0, 310.0, 250.0, -0.1, 0.02, 0.001, -0.002])[: len(names)]
-    camera = Camera("a", lens, (640, 480), params)
-    there = colmap.colmap_camera(camera, colmap.MAPPING_MODEL[lens])
-    back = colmap.camera_from_colmap("a", lens, there)
-    known = len(back.params) if lens not in ("radtan", "kannala_brandt") else 6
-    np.testing.assert_allclose(back.params[:known], params[:known])
-    np.testing.assert_array_equal(back.params[known:], 0.0)
-    assert there.principal_point_x == 310.5 and there.principal_point_y == 250.5
+def test_a_mapped_camera_starts_any_lens(lens):
+    """COLMAP's own first guess, undistorted: ours sees the whole image as it does."""
+    model = pycolmap.Camera.create_from_model_name(1, MAPPING_MODEL[lens], 400.0, 640, 480)
+    camera = colmap.camera_from_colmap("cam", lens, model)
+    rays = unproject(camera, grid())
+    assert np.isfinite(rays).all()
+    ahead = rays[..., 2] > 0
+    theirs = [model.img_from_cam(ray) for ray in rays[ahead]]
+    np.testing.assert_allclose(grid()[ahead] + 0.5, theirs, atol=0.2)

@@ -1,14 +1,19 @@
 """rig.yaml: a table of good and bad files, each bad one with the line that it earns."""
 
+from typing import get_args
+
 import pytest
 from synthetic.scans import picture, silent
 
+from graphs.losses import LossChoice
 from sfm_calib.cache import Cache
 from sfm_calib.config import Options, RigConfig, load_rig_config
-from sfm_calib.errors import CalibrationError
+from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.images import read_scan
 from sfm_calib.nominal import check_config
 
+CLICK = "{camera: a, frame: '01', pixel: [1, 2.5]}"
+MARK = f"[{CLICK}, {CLICK}, {CLICK}]"
 GOOD = {
     "an empty file": "",
     "a comment": "# nothing yet",
@@ -18,6 +23,14 @@ GOOD = {
     "a camera of which nothing is said": "cameras: {left: {}}",
     "a nominal rig": "cameras: {left: {cam_from_rig: {rotation_wxyz: [0.71, 0, 0.71, 0]}}}",
     "a baseline": "scale: {baseline: {cameras: [a, b], length_m: 0.2, sigma_m: 0.001}}",
+    "a path": "scale: {frames: {between: ['000000', '000009'], length_m: 4, sigma_m: 0.1}}",
+    "two marks": f"scale: {{points: {{between: [{MARK}, {MARK}], length_m: 1, sigma_m: 0.1}}}}",
+    "rough clicks": (
+        f"scale: {{points: {{between: [{MARK}, {MARK}], length_m: 1, sigma_m: 0.1, "
+        "click_sigma_px: 2.5}}"
+    ),
+    "no scale": "scale: {}",
+    **{f"the loss {name}": f"loss: {name}" for name in get_args(LossChoice)},
 }
 BAD = {
     "unknown key": ("lense: radtan", "unknown key 'lense': did you mean 'lens'?"),
@@ -34,10 +47,61 @@ BAD = {
         "did you mean 'length_m'?",
     ),
     "unknown scale": ("scale: {base: 1}", "did you mean 'baseline'?"),
+    "unknown key of a path": (
+        "scale: {frames: {betwen: ['1', '2'], length_m: 1, sigma_m: 1}}",
+        "unknown key 'scale.frames.betwen': did you mean 'between'? Valid here: between, length_m",
+    ),
+    "unknown key of points": (
+        f"scale: {{points: {{between: [{MARK}, {MARK}], length_m: 1, sigma_m: 1, "
+        "click_sigma: 1}}",
+        "'scale.points.click_sigma': did you mean 'click_sigma_px'?",
+    ),
+    "unknown key of a click": (
+        f"scale: {{points: {{between: [{MARK}, {MARK.replace('pixel', 'pixels')}], length_m: 1, "
+        "sigma_m: 1}}",
+        "'scale.points.between.1.0.pixels': did you mean 'pixel'? Valid here: camera, frame, pixel",
+    ),
+    "two scales": (
+        "scale: {baseline: {cameras: [a, b], length_m: 1, sigma_m: 1}, "
+        "frames: {between: ['1', '2'], length_m: 1, sigma_m: 1}}",
+        "scale: 2 sources (baseline and frames) and one unit of length: keep the distance that you",
+    ),
+    "a path of no length": (
+        "scale: {frames: {between: ['1', '2'], length_m: 0, sigma_m: 1}}",
+        "scale.frames.length_m: Input should be greater than 0 (got 0)",
+    ),
+    "a span of negative length": (
+        f"scale: {{points: {{between: [{MARK}, {MARK}], length_m: -2, sigma_m: 1}}}}",
+        "scale.points.length_m: Input should be greater than 0 (got -2)",
+    ),
+    "two clicks": (
+        f"scale: {{points: {{between: [{MARK}, [{CLICK}, {CLICK}]], length_m: 1, sigma_m: 1}}}}",
+        "scale.points.between: the second mark has 2 clicks and needs 3: click it in more images",
+    ),
+    "one mark": (
+        f"scale: {{points: {{between: [{MARK}], length_m: 1, sigma_m: 1}}}}",
+        "scale.points.between.1: Field required",
+    ),
+    "a click of one number": (
+        f"scale: {{points: {{between: [{MARK}, {MARK.replace(', 2.5', '')}], length_m: 1, "
+        "sigma_m: 1}}",
+        "scale.points.between.1.0.pixel.1: Field required",
+    ),
+    "exact clicks": (
+        f"scale: {{points: {{between: [{MARK}, {MARK}], length_m: 1, sigma_m: 1, "
+        "click_sigma_px: 0}}",
+        "scale.points.click_sigma_px: Input should be greater than 0 (got 0)",
+    ),
+    "a frame that YAML takes for a number": (
+        "scale: {frames: {between: [000000, 000009], length_m: 1, sigma_m: 1}}",
+        "scale.frames.between.0: the name 0 is a int; put it in quotes",
+    ),
+    "a reference that YAML takes for a number": ("reference: 0", "the name 0 is a int; put it in"),
+    "an unknown loss": ("loss: caucy", "'geman_mcclure' or 'adaptive' (got 'caucy')"),
     "wrong type": ("max_features: many", "max_features: Input should be a valid integer"),
     "wrong type shows the value": ("max_features: many", "(got 'many')"),
     "a list for a mapping": ("cameras: [left, right]", "cameras: Input should be a valid dict"),
-    "an unknown lens": ("lens: fisheye", "'kannala_brandt' or 'auto' (got 'fisheye')"),
+    "an unknown lens": ("lens: fisheye", "'double_sphere' or 'auto' (got 'fisheye')"),
     "out of range": ("max_features: 5", "greater than or equal to 100 (got 5)"),
     "not a number": ("cameras: {left: {params: {fx: .nan}}}", "cameras.left.params.fx: "),
     "an infinite sigma": ("principal_point_sigma: .inf", "principal_point_sigma: "),
@@ -128,7 +192,15 @@ UNKNOWN = {
     "parameter": ({"cameras": {"left": {"params": {"k9": 1}}}}, "a parameter 'k9'"),
     "baseline to itself": (
         {"scale": {"baseline": {"cameras": ["left", "left"], "length_m": 1, "sigma_m": 1}}},
-        "from left to itself",
+        "a baseline from left to itself; name two cameras",
+    ),
+    "frame": (
+        {"scale": {"frames": {"between": ["0", "7"], "length_m": 1, "sigma_m": 1}}},
+        "scale.frames.between: the scan has no frame '7'; it has 0, 1, 2",
+    ),
+    "path to itself": (
+        {"scale": {"frames": {"between": ["1", "1"], "length_m": 1, "sigma_m": 1}}},
+        "a distance from 1 to itself; name two frames",
     ),
 }
 
@@ -138,3 +210,9 @@ def test_names_that_the_scan_does_not_have(scan, config, message):
     with pytest.raises(CalibrationError) as caught:
         check_config(RigConfig.model_validate(config), scan)
     assert message in str(caught.value)
+
+
+def test_many_names_are_not_all_listed():
+    frames = [f"{i:06d}" for i in range(51)]
+    assert nearest("00033", frames) == "did you mean '000033'? it has 51, 000000 to 000050"
+    assert nearest("x", frames[:3]) == "it has 000000, 000001, 000002"

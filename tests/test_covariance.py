@@ -9,23 +9,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic.dense import linearise_dense, of_others
+from synthetic.problems import small_problem
 
 from graphs import covariance as covariance_module
 from graphs import gauge
-from graphs.build import GraphOptions, LossName, build
+from graphs.build import GraphOptions, build
+from graphs.clusters import homogeneous
 from graphs.covariance import (
     MIN_CLUSTERS,
     CalibrationCovariance,
+    ClusterSums,
     Covariance,
+    calibration_columns,
     calibration_covariance,
     clustered_variance,
 )
-from graphs.frames import FloatArray, Transform
+from graphs.frames import FloatArray
 from graphs.gauge import Gauge
+from graphs.losses import LossName, weight_and_slope
+from graphs.noise import loss_moments
 from graphs.priors import LensPrior, weak_lens_prior
-from graphs.problem import Estimate, KnownBaseline, Observations, Problem
-from graphs.scale import baseline_unit, in_unit_baseline
-from graphs.solve import solve
+from graphs.problem import Estimate, KnownBaseline, Observations, Problem, residuals_px
+from graphs.solve import solve, threads
+from graphs.unit import in_unit_baseline
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5
@@ -130,57 +137,6 @@ def test_the_covariance_scales_with_the_unit() -> None:
         assert theirs.sigma[name] == pytest.approx(factor * sigma, rel=1e-3), name
 
 
-def unit_rig() -> tuple[Estimate, Covariance]:
-    problem = problem_of(rig="triple", frames=6)
-    estimate = problem.initial
-    kinds = [f"{kind}_{axis}" for kind in ("rotation", "translation") for axis in "xyz"]
-    names = ["cam1.fx", *(f"cam{i}.{kind}" for i in (1, 2) for kind in kinds)]
-    root = np.random.default_rng(0).standard_normal((13, 13))
-    return estimate, Covariance(tuple(names), root @ root.T)
-
-
-@pytest.mark.parametrize("far", [1, 2])
-def test_in_unit_baseline_by_finite_differences(far: int) -> None:
-    estimate, covariance = unit_rig()
-
-    def reported(change: FloatArray) -> FloatArray:
-        """fx, then each camera's turn and translation over the length of `far`'s."""
-        moved = [
-            Transform(t.rotation, t.translation + change[1 + 6 * i + 3 : 1 + 6 * i + 6])
-            for i, t in enumerate(estimate.cam_from_rig[1:])
-        ]
-        length = np.linalg.norm(moved[far - 1].translation)
-        parts = [
-            np.concatenate([change[1 + 6 * i : 4 + 6 * i], t.translation / length])
-            for i, t in enumerate(moved)
-        ]
-        return np.concatenate([change[:1], *parts])
-
-    step = 1e-6
-    jacobian = np.stack(
-        [(reported(d) - reported(-d)) / (2 * step) for d in step * np.eye(13)], axis=1
-    )
-    expected = jacobian @ covariance.matrix @ jacobian.T
-    ours = in_unit_baseline(covariance, estimate, far)
-    assert ours.names == covariance.names
-    np.testing.assert_allclose(ours.matrix, expected, rtol=1e-6, atol=1e-6)
-    along = np.zeros(13)
-    along[1 + 6 * (far - 1) + 3 : 1 + 6 * far] = estimate.cam_from_rig[far].translation
-    assert along @ ours.matrix @ along == pytest.approx(0, abs=1e-9)
-
-
-def test_the_farthest_camera_gives_the_unit_when_it_is_determined() -> None:
-    estimate, covariance = unit_rig()
-    lengths = [float(np.linalg.norm(t.translation)) for t in estimate.cam_from_rig]
-    far = int(np.argmax(lengths))
-    places = [i for i, name in enumerate(covariance.names) if f"cam{far}.translation" in name]
-    exact, vague = np.eye(13), np.eye(13)
-    exact[places, places] = (lengths[far] / 20) ** 2 / 3
-    vague[places, places] = (lengths[far] / 5) ** 2 / 3
-    assert baseline_unit(estimate, 0, Covariance(covariance.names, exact)) == far
-    assert baseline_unit(estimate, 0, Covariance(covariance.names, vague)) is None
-
-
 # ---- the assumed noise, and priors ---------------------------------------------------------
 
 
@@ -194,6 +150,35 @@ def test_the_assumed_noise_does_not_matter(loss: LossName) -> None:
     _, theirs = solved(problem, GraphOptions(SIGMA_PX / 2, loss, 4.0, lens_priors=none))
     for name, sigma in ours.stated.sigma.items():
         assert theirs.stated.sigma[name] == pytest.approx(sigma, rel=2e-3), name
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_relative_sigmas_are_only_relative(loss: LossName) -> None:
+    """Twice the relative sigma of half the sigma_px: the same covariance, model's and stated."""
+    problem = problem_of(outlier_share=0.02, outlier_kind="heavy")
+    seen = problem.observations
+    doubled = replace(seen, relative_sigma=np.full(len(seen), 2.0))
+    _, plain = solved(problem, GraphOptions(SIGMA_PX, loss, 2.0))
+    _, other = solved(replace(problem, observations=doubled), GraphOptions(SIGMA_PX / 2, loss, 2.0))
+    np.testing.assert_allclose(other.model.matrix, plain.model.matrix, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(other.stated.matrix, plain.stated.matrix, rtol=1e-6, atol=1e-12)
+
+
+def test_noisier_observations_are_known_to_be_noisier() -> None:
+    """Half of them four times as noisy: said so, sigmas are of the noise that there is."""
+    problem = problem_of(sigma_px=0.0)
+    seen, rng = problem.observations, np.random.default_rng(3)
+    relative = np.where(rng.random(len(seen)) < 0.5, 1.0, 4.0)
+    noise = SIGMA_PX * relative[:, None] * rng.standard_normal(seen.pixels.shape)
+    noisy = replace(seen, pixels=seen.pixels + noise, relative_sigma=relative)
+    options = GraphOptions(SIGMA_PX, "none")
+    graph = build(replace(problem, observations=noisy), options)
+    estimate, values, _ = solve(graph)
+    moments = loss_moments(graph.problem, options, residuals_px(estimate, noisy))
+    assert moments.score_variance == pytest.approx(1, rel=0.1)
+    whole = calibration_covariance(graph, estimate, values).model.sigma["cam0.fx"]
+    _, quiet = solved(problem_of(), GraphOptions(SIGMA_PX, "none"))
+    assert 1.3 < whole / quiet.model.sigma["cam0.fx"] < 1.8
 
 
 def test_a_prior_that_knows_everything_leaves_its_own_sigma(
@@ -231,21 +216,69 @@ def test_overrated_data_pull_against_the_prior_at_their_own_noise() -> None:
 # ---- frames that err together --------------------------------------------------------------
 
 
-def test_clustered_variance_by_hand() -> None:
-    """Two frames, two tracks, one of them seen by both cameras of the first frame: 4 pairs."""
-    scores = np.repeat([[1.0], [10], [2], [3], [5]], 2, axis=0)
-    errors = np.tile([1.0, 0.0], 5)
-    seen = Observations(
-        np.zeros((5, 2)),
-        np.array([0, 0, 0, 7, 7]),
-        np.array([0, 1, 0, 0, 0]),
-        np.array([4, 4, 9, 4, 9]),
-    )
-    by_frame = 2 / 1 * ((1 + 10 + 2) ** 2 + (3 + 5) ** 2)
+def test_sums_over_clusters_by_hand() -> None:
+    """Two frames and two tracks: one seen by both cameras of the first frame and by the second,
+    where the other is seen by both; 3 pairs."""
+    moved = np.array([[1.0], [10], [3], [2], [5]])
+    frame, begins = np.array([0, 0, 1, 1, 1]), np.array([0, 3])
+    by_frame = 2 / 1 * ((1 + 10) ** 2 + (3 + 2 + 5) ** 2)
     by_track = 2 / 1 * ((1 + 10 + 3) ** 2 + (2 + 5) ** 2)
-    by_both = 4 / 3 * ((1 + 10) ** 2 + 2**2 + 3**2 + 5**2)
+    by_both = 3 / 2 * ((1 + 10) ** 2 + 3**2 + (2 + 5) ** 2)
     expected = by_frame + by_track - by_both
-    np.testing.assert_allclose(clustered_variance(scores, errors, seen), [expected])
+    together = ClusterSums(2, 1)
+    together.add(moved, frame, begins)
+    np.testing.assert_allclose(together.variance(), [expected])
+    apart = ClusterSums(2, 1)
+    for rows in (slice(0, 3), slice(3, 5)):
+        one = ClusterSums(2, 1)
+        one.add(moved[rows], frame[rows], np.array([0]))
+        apart.merge(one)
+    np.testing.assert_allclose(apart.variance(), [expected])
+
+
+def test_no_variance_is_below_that_of_frames_or_tracks_alone() -> None:
+    """One frame's two tracks err against each other: their difference is no less than theirs."""
+    sums = ClusterSums(2, 1)
+    sums.add(np.array([[3.0], [-3.0]]), np.array([0, 0]), np.array([0, 1]))
+    np.testing.assert_allclose(sums.variance(), [2 * (3.0**2 + 3.0**2)])
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_clustered_variance_is_that_of_dense_algebra(
+    loss: LossName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows by finite differences, points eliminated by a dense Schur complement; scores of every
+    observation summed by frame, by track, and by both."""
+    monkeypatch.setattr("graphs.clusters.CHUNK", 64)  # several chunks
+    problem, _ = small_problem("radtan", cameras=3, frames=7, points=40, baseline=True)
+    sigma = np.random.default_rng(0).uniform(0.5, 2, len(problem.observations))
+    seen = replace(problem.observations, relative_sigma=sigma)
+    graph = build(replace(problem, observations=seen), GraphOptions(SIGMA_PX, loss, 2.0))
+    estimate, values, _ = solve(graph)
+    dense = linearise_dense(graph, values, estimate.points, SIGMA_PX * sigma)
+    lengths = np.linalg.norm(dense.residuals, axis=1)
+    weights = weight_and_slope(loss, 2.0, lengths)[0]
+    H = dense.normal_equations(weights, weights[:, None, None] * np.eye(2))[0]
+    H += of_others(graph, values)
+    scale = 1 / np.sqrt(np.diag(H))
+    inverse = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
+    columns = calibration_columns(graph, estimate)[0]
+    followed = dense.across_points(weights)
+    moved = np.einsum("na,nak,n->nk", dense.residuals, followed, weights) @ inverse[:, columns]
+
+    def summed(*labels: FloatArray) -> FloatArray:
+        _, group = np.unique(np.stack(labels), axis=1, return_inverse=True)
+        sums = np.zeros((group.max() + 1, moved.shape[1]))
+        np.add.at(sums, group.ravel(), moved)
+        return (sums**2).sum(0) * len(sums) / (len(sums) - 1)
+
+    frames, tracks = summed(seen.frame), summed(seen.point)
+    both = summed(seen.frame, seen.point)
+    expected = np.maximum(frames + tracks - both, np.maximum(frames, tracks))
+    with threads() as pool:
+        points = homogeneous(graph.tracks, estimate.points)
+        ours = clustered_variance(graph, graph.variables(values), points, inverse[:, columns], pool)
+    np.testing.assert_allclose(ours, expected, rtol=1e-5)
 
 
 def sheared(problem: Problem, sigma: float, seed: int) -> Problem:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from synthetic.problems import calibration_of, small_problem
 
-from graphs.build import GraphOptions, LossName
+from graphs.build import GraphOptions, build
+from graphs.losses import LOSS_NAMES, LossName
 from graphs.noise import loss_moments, redundancy, robust_sigma_px
-from graphs.problem import KnownBaseline, Problem
+from graphs.problem import KnownBaseline, Observations, Problem
+from graphs.solve import solve
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5
@@ -79,6 +82,20 @@ def test_sigma_px_is_that_of_the_noise_with_half_of_it_wild() -> None:
     assert 0.7 < robust_sigma_px(problem, shrunk) < 1.2
 
 
+def test_sigma_px_is_that_of_a_relative_sigma_of_one() -> None:
+    problem, rng = problem_of(), np.random.default_rng(3)
+    relative = rng.uniform(0.2, 5, len(problem.observations))
+    seen = replace(problem.observations, relative_sigma=relative)
+    shrunk = 0.7 * np.sqrt(redundancy(problem)) * rng.standard_normal((len(seen), 2))
+    noisy = replace(problem, observations=seen)
+    ours = robust_sigma_px(noisy, shrunk * relative[:, None])
+    assert ours == pytest.approx(robust_sigma_px(problem, shrunk), rel=1e-12)
+    options = GraphOptions(SIGMA_PX, "cauchy")
+    moments = loss_moments(noisy, options, shrunk * relative[:, None])
+    plain = loss_moments(problem, options, shrunk)
+    assert astuple(moments) == pytest.approx(astuple(plain), rel=1e-12)
+
+
 def test_redundancy_counts_every_unknown() -> None:
     problem = problem_of(baseline_sigma_m=0.0)
     unknowns = 2 * 6 + 6 + 6 * len(problem.frame_names) + 3 * len(problem.initial.points) - 7
@@ -86,3 +103,35 @@ def test_redundancy_counts_every_unknown() -> None:
     assert redundancy(problem) == pytest.approx(1 - unknowns / measured)
     known = replace(problem, scale=KnownBaseline((0, 1), 1.0, 0.1))
     assert redundancy(known) == pytest.approx(1 - (unknowns + 1) / measured)
+
+
+# ---- the noise of single observations, in the solver ----------------------------------------
+
+
+def test_half_the_variance_is_as_good_as_seeing_twice() -> None:
+    problem, _ = small_problem("radtan", start_error=0.3, baseline=True)
+    seen = problem.observations
+    twice = np.random.default_rng(0).random(len(seen)) < 0.3
+    repeated = Observations(*(
+        np.concatenate([getattr(seen, name), getattr(seen, name)[twice]])
+        for name in ("pixels", "frame", "camera", "point")
+    ))  # fmt: skip
+    weighted = replace(seen, relative_sigma=np.where(twice, np.sqrt(0.5), 1.0))
+    options = GraphOptions(SIGMA_PX, "none")
+    graphs = [build(replace(problem, observations=own), options) for own in (repeated, weighted)]
+    runs = [solve(graph, relative_tolerance=1e-13) for graph in graphs]
+    assert runs[0][2].cost == pytest.approx(runs[1][2].cost, rel=1e-9)
+    np.testing.assert_allclose(
+        calibration_of(runs[0][0]), calibration_of(runs[1][0]), rtol=1e-5, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("loss", LOSS_NAMES)
+def test_relative_sigmas_are_of_sigma_px(loss: LossName) -> None:
+    problem, _ = small_problem("radtan", start_error=0.3)
+    halved = replace(problem.observations, relative_sigma=np.full(len(problem.observations), 2.0))
+    options = GraphOptions(SIGMA_PX, loss)
+    ours = build(replace(problem, observations=halved), replace(options, sigma_px=SIGMA_PX / 2))
+    plain = build(problem, options)
+    for a, b in zip(ours.tracks.clusters, plain.tracks.clusters, strict=True):
+        np.testing.assert_allclose(a.root_information, b.root_information)

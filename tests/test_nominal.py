@@ -7,16 +7,24 @@ import numpy as np
 import pytest
 from synthetic.scans import QUICK, simulation
 
+from graphs.camera import Camera, nominal_params
 from graphs.frames import Transform
-from graphs.lenses import Camera, nominal_params
+from graphs.lenses import LENS_NAMES, LENSES, LensName
 from graphs.problem import Estimate
 from sfm_calib import colmap, mapping
 from sfm_calib.cache import Cache
 from sfm_calib.cli import main
-from sfm_calib.config import RigConfig, load_rig_config
+from sfm_calib.config import RigConfig, ScaleConfig, load_rig_config
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Scan, ScanImage, read_scan
-from sfm_calib.nominal import check_config, lens_of, nominal_rig, rig_priors, start_from_config
+from sfm_calib.nominal import (
+    check_config,
+    known_cameras,
+    lens_of,
+    nominal_rig,
+    rig_priors,
+    start_from_config,
+)
 from sfm_calib.result import load_calibration
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
@@ -71,14 +79,11 @@ def test_rig_priors_need_a_sigma_and_translations_a_scale() -> None:
     np.testing.assert_allclose(prior.cam_from_rig.rotation, expected.rotation, atol=1e-12)
     assert prior.sigma_rotation == pytest.approx(np.radians(2.0))
     assert prior.sigma_translation == np.inf
-    metric = said.model_copy(
-        update={
-            "scale": RigConfig.model_validate(
-                {"scale": {"baseline": {"cameras": ["a", "b"], "length_m": 1, "sigma_m": 0.1}}}
-            ).scale
-        }
-    )
-    assert rig_priors(start, metric, 0)[1].sigma_translation == 0.01
+    baseline = {"cameras": ["a", "b"], "length_m": 1, "sigma_m": 0.1}
+    path = {"between": ["0", "1"], "length_m": 1, "sigma_m": 0.1}
+    for scale in ({"baseline": baseline}, {"frames": path}):
+        metric = said.model_copy(update={"scale": ScaleConfig.model_validate(scale)})
+        assert rig_priors(start, metric, 0)[1].sigma_translation == 0.01
 
 
 @pytest.mark.parametrize(
@@ -100,6 +105,26 @@ def test_the_lens_of_a_rig_and_of_a_lone_camera() -> None:
     assert lens_of(RigConfig(), "a", 2) == "radtan"
     assert lens_of(RigConfig(), "a", 1) == "radial"
     assert lens_of(RigConfig(lens="pinhole"), "a", 2) == "pinhole"
+
+
+def test_a_parameter_is_told_by_its_lens() -> None:
+    scan = scan_of((0, 0, "a/0.png"), (1, 0, "b/0.png"))
+    said = {"cameras": {"a": {"lens": "brown", "params": {"k3": 0.1}}}}
+    check_config(RigConfig.model_validate(said), scan)
+    said = {"cameras": {"a": {"lens": "eucm", "params": {"aplha": 0.6}}}}
+    with pytest.raises(
+        CalibrationError, match=r"did you mean 'alpha'\? it has fx, fy, cx, cy, alph"
+    ):
+        check_config(RigConfig.model_validate(said), scan)
+
+
+@pytest.mark.parametrize("lens", LENS_NAMES)
+def test_a_given_focal_length_is_that_of_both_axes_and_the_rest_nominal(lens: LensName) -> None:
+    said = {"cameras": {"b": {"lens": lens, "params": {"fx": 333.0, "cy": 200.0}}}}
+    known = known_cameras(RigConfig.model_validate(said), scan_of((0, 0, "a"), (1, 0, "b")))
+    assert list(known) == [1]
+    np.testing.assert_allclose(known[1].params[:4], [333, 333, 319.5, 200])
+    np.testing.assert_array_equal(known[1].params[4:], LENSES[lens].nominal)
 
 
 def test_rig_mapping_needs_frames_that_are_named_alike() -> None:

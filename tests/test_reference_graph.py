@@ -1,7 +1,8 @@
-"""The reference graph against three independent judges: a dense inverse, gtsam.Marginals, COLMAP.
+"""Our graph, the reference graph of GTSAM's own factors, and judges of both.
 
-All on problems small enough to invert whole. Priors are as good as absent wherever the judge has
-none, so that nothing but the observations and the loss is compared.
+The reference is judged by COLMAP and by a dense inverse; it then judges ours: the optimum, every
+sigma and every cross-covariance. All on problems small enough to invert whole. Priors are as good
+as absent wherever the judge has none.
 """
 
 from __future__ import annotations
@@ -11,20 +12,36 @@ from functools import cache
 
 import gtsam
 import numpy as np
-import pycolmap
 import pytest
 from scipy.linalg import block_diag
+from synthetic.bundle_adjustment import bundle_adjust
+from synthetic.problems import calibration_of
 
-from graphs.build import NO_KNOWLEDGE, CalibrationGraph, GraphOptions, LossName, build
-from graphs.covariance import CalibrationCovariance, calibration_covariance
+from graphs.build import NO_KNOWLEDGE, CalibrationGraph, GraphOptions, build
+from graphs.clusters import homogeneous
+from graphs.covariance import (
+    CalibrationCovariance,
+    calibration_columns,
+    calibration_covariance,
+    responses,
+)
 from graphs.frames import FloatArray, Transform, angle_between, log_rotation
 from graphs.keys import lens_key, rig_key
-from graphs.lenses import LENS_NAMES, LensName
+from graphs.lenses import LensName
+from graphs.losses import LOSS_NAMES, SCALE_95, LossName
 from graphs.priors import LensPrior
 from graphs.problem import Estimate, IntArray, Problem, residuals_px
-from graphs.reference import native_slots
-from graphs.solve import SolveSummary, solve
-from sfm_calib.colmap import EXACT_MODEL, colmap_camera, parameter_names
+from graphs.reference import (
+    NATIVE_LENSES,
+    NATIVE_SIZE,
+    ReferenceGraph,
+    build_reference,
+    native_slots,
+    native_values,
+    reference_estimate,
+    solve_reference,
+)
+from graphs.solve import SolveSummary, evaluate, linearised, solve, threads
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5
@@ -34,16 +51,20 @@ SMALL = TrackOptions(
     baseline_sigma_m=0, outlier_share=0.02, outlier_kind="heavy",
 )  # fmt: skip
 LOSSES: tuple[LossName, ...] = ("none", "cauchy")
-JUDGED_LENSES: tuple[LensName, ...] = ("pinhole", "radtan", "kannala_brandt")
+JUDGED_LENSES: tuple[LensName, ...] = ("radtan", "kannala_brandt")
 
 
 @dataclass(frozen=True)
 class Solved:
+    """Our optimum of a small scan, and the reference's, which starts there."""
+
     graph: CalibrationGraph
     estimate: Estimate
     values: gtsam.Values
     summary: SolveSummary
     covariance: CalibrationCovariance
+    reference: ReferenceGraph
+    native: gtsam.Values
 
 
 def no_knowledge(problem: Problem) -> tuple[LensPrior, ...]:
@@ -54,117 +75,40 @@ def no_knowledge(problem: Problem) -> tuple[LensPrior, ...]:
     )
 
 
+def options_of(loss: LossName, priors: tuple[LensPrior, ...] = ()) -> GraphOptions:
+    return GraphOptions(SIGMA_PX, loss, min(SCALE_95[loss], 1e6), lens_priors=priors)
+
+
 @cache
-def solved(lens: LensName, loss: LossName, weak: bool = False) -> Solved:
-    """The optimum of a small scan; `weak` keeps the priors that a calibration has."""
-    problem, _ = simulate_tracks(SMALL.model_copy(update={"lens": lens}), np.random.default_rng(20))
-    priors = () if weak else no_knowledge(problem)
-    graph = build(problem, GraphOptions(SIGMA_PX, loss, lens_priors=priors))
+def solved(
+    lens: LensName, loss: LossName, weak: bool = False, baseline: bool = False, near: bool = False
+) -> Solved:
+    """weak: with the priors that a calibration has; baseline: with a measured one; near: starts
+    at the truth, with noise that puts nothing out of sight of a loss that has several optima."""
+    changes = {"lens": lens, "baseline_sigma_m": 5e-4 * baseline}
+    if near:
+        changes |= {"outlier_share": 0.0, "sigma_px": SIGMA_PX / 2, "min_track_length": 4}
+    problem, true = simulate_tracks(SMALL.model_copy(update=changes), np.random.default_rng(20))
+    if near:
+        problem = replace(problem, initial=true)
+    options = options_of(loss, () if weak else no_knowledge(problem))
+    graph = build(problem, options)
     estimate, values, summary = solve(graph, relative_tolerance=1e-14)
     assert summary.converged
-    return Solved(graph, estimate, values, summary, calibration_covariance(graph, estimate, values))
+    covariance = calibration_covariance(graph, estimate, values)
+    reference = build_reference(problem, options)
+    native = polished(reference, native_values(replace(problem, initial=estimate)))
+    return Solved(graph, estimate, values, summary, covariance, reference, native)
+
+
+def polished(reference: ReferenceGraph, values: gtsam.Values) -> gtsam.Values:
+    """After GTSAM's Gauss-Newton steps, weighted anew each time, until they are rounding."""
+    for _ in range(8):
+        values = values.retract(reference.factors.linearize(values).optimize())
+    return values
 
 
 # ---- the optimum, judged by COLMAP ---------------------------------------------------------
-
-COLMAP_LOSS = {"none": "TRIVIAL", "cauchy": "CAUCHY"}
-
-
-def rigid(b_from_a: Transform) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(b_from_a.rotation), b_from_a.translation)
-
-
-def reconstruction_of(problem: Problem, start: Estimate) -> pycolmap.Reconstruction:
-    """The same rig, frames, points and observations for COLMAP; its ids count from one."""
-    model = pycolmap.Reconstruction()
-    rig = pycolmap.Rig(rig_id=1)
-    sensors = []
-    for index, camera in enumerate(start.cameras):
-        colmap = colmap_camera(camera, EXACT_MODEL[camera.lens], index + 1)
-        model.add_camera(colmap)
-        sensors.append(colmap.sensor_id)
-        if index == problem.reference:
-            rig.add_ref_sensor(colmap.sensor_id)
-        else:
-            rig.add_sensor(colmap.sensor_id, rigid(start.cam_from_rig[index]))
-    model.add_rig(rig)
-    seen, n_cameras = problem.observations, len(start.cameras)
-    rows = {
-        (f, c): np.flatnonzero((seen.frame == f) & (seen.camera == c))
-        for f in range(len(start.rig_from_world))
-        for c in range(n_cameras)
-    }
-    for f, rig_from_world in enumerate(start.rig_from_world):
-        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
-        for c in range(n_cameras):
-            frame.add_data_id(pycolmap.data_t(sensors[c], f * n_cameras + c + 1))
-        frame.rig_from_world = rigid(rig_from_world)
-        model.add_frame(frame)
-    for (f, c), own in rows.items():
-        image = pycolmap.Image(
-            name=f"{c}/{f}",
-            keypoints=seen.pixels[own] + 0.5,
-            camera_id=c + 1,
-            image_id=f * n_cameras + c + 1,
-        )
-        image.frame_id = f + 1
-        model.add_image(image)
-    for f in range(len(start.rig_from_world)):
-        model.register_frame(f + 1)
-    keypoint = {int(row): place for own in rows.values() for place, row in enumerate(own)}
-    for point, xyz in enumerate(start.points):
-        track = pycolmap.Track()
-        for row in np.flatnonzero(seen.point == point).tolist():
-            track.add_element(
-                int(seen.frame[row]) * n_cameras + int(seen.camera[row]) + 1, keypoint[row]
-            )
-        model.add_point3D(xyz, track)
-    return model
-
-
-def bundle_adjust(
-    problem: Problem, start: Estimate, options: GraphOptions
-) -> tuple[Estimate, float]:
-    """COLMAP's optimum from `start`, and Ceres's cost in px squared."""
-    model = reconstruction_of(problem, start)
-    settings = pycolmap.BundleAdjustmentOptions()
-    settings.print_summary = False
-    settings.refine_principal_point = True
-    settings.ceres.loss_function_type = pycolmap.LossFunctionType(COLMAP_LOSS[options.loss])
-    settings.ceres.loss_function_scale = options.loss_scale * options.sigma_px
-    settings.ceres.solver_options.max_num_iterations = 500
-    settings.ceres.solver_options.function_tolerance = 0.0
-    settings.ceres.solver_options.gradient_tolerance = 1e-10
-    settings.ceres.solver_options.parameter_tolerance = 1e-12
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_ceres_bundle_adjuster(settings, config, model).solve()
-    assert summary.num_residuals == 2 * len(problem.observations)
-    return estimate_of(model, problem), summary.ceres_summary.final_cost
-
-
-def transform_of(b_from_a: pycolmap.Rigid3d) -> Transform:
-    return Transform(b_from_a.rotation.matrix(), np.ravel(b_from_a.translation))
-
-
-def estimate_of(model: pycolmap.Reconstruction, problem: Problem) -> Estimate:
-    cameras, cam_from_rig = [], []
-    for index, camera in enumerate(problem.initial.cameras):
-        colmap = model.cameras[index + 1]
-        named = dict(zip(parameter_names(colmap), colmap.params.tolist(), strict=True))
-        named |= {"cx": named["cx"] - 0.5, "cy": named["cy"] - 0.5}
-        cameras.append(replace(camera, params=np.array([named[name] for name in camera.names])))
-        is_reference = index == problem.reference
-        cam_from_rig.append(
-            Transform.identity()
-            if is_reference
-            else transform_of(model.rigs[1].sensor_from_rig(colmap.sensor_id))
-        )
-    frames = [model.frames[f + 1].rig_from_world for f in range(len(problem.frame_names))]
-    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
-    return Estimate(tuple(cameras), tuple(cam_from_rig), tuple(map(transform_of, frames)), points)
 
 
 def in_baselines(estimate: Estimate) -> Estimate:
@@ -190,9 +134,54 @@ def test_the_optimum_is_that_of_colmap(lens: LensName, loss: LossName) -> None:
             np.testing.assert_allclose(ours.translation, theirs.translation, rtol=1e-4)
 
 
+# ---- the optimum, judged by the reference ------------------------------------------------
+
+
+def sigmas_of(case: Solved) -> FloatArray:
+    """Model sigmas (n,) in the order of `calibration_of`, zero where there is none."""
+    sigma = case.covariance.model.sigma
+    lenses = [sigma[f"{c.name}.{name}"] for c in case.estimate.cameras for name in c.names]
+    return np.append(lenses, np.zeros(12 * len(case.estimate.cameras)))
+
+
+def assert_same_optimum(ours: Estimate, theirs: Estimate, sigma: FloatArray) -> None:
+    """To 1e-6 of each number, or to 1e-5 of its sigma: a coefficient may be next to zero."""
+    a, b = calibration_of(ours), calibration_of(theirs)
+    assert (np.abs(a - b) <= 1e-6 * np.abs(b) + 1e-5 * sigma + 1e-9).all()
+
+
+# every lens with every loss, and each of them once with a measured baseline
+ALL = [(lens, loss, False) for lens in NATIVE_LENSES for loss in LOSS_NAMES]
+ALL += [(lens, loss, True) for lens, loss in zip(NATIVE_LENSES, LOSS_NAMES, strict=True)]
+
+
+@pytest.mark.parametrize(("lens", "loss", "baseline"), ALL)
+def test_our_optimum_is_one_of_the_reference(
+    lens: LensName, loss: LossName, baseline: bool
+) -> None:
+    """GTSAM's Gauss-Newton on its own factors, started there, stays there."""
+    case = solved(lens, loss, weak=True, baseline=baseline, near=True)
+    theirs = reference_estimate(case.native, case.graph.problem)
+    assert_same_optimum(case.estimate, theirs, sigmas_of(case))
+    assert case.reference.factors.error(case.native) == pytest.approx(case.summary.cost, rel=1e-9)
+    np.testing.assert_allclose(case.estimate.points, theirs.points, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("lens", JUDGED_LENSES)
+def test_the_reference_finds_our_optimum_by_itself(lens: LensName, loss: LossName) -> None:
+    """GTSAM's Levenberg-Marquardt from the same start, 1 % off in focal length."""
+    case = solved(lens, loss, weak=True)
+    theirs, values, _ = solve_reference(case.reference)
+    assert case.reference.factors.error(values) == pytest.approx(case.summary.cost, rel=1e-8)
+    theirs = reference_estimate(polished(case.reference, values), case.graph.problem)
+    assert_same_optimum(case.estimate, theirs, sigmas_of(case))
+
+
 # ---- the marginals, judged by a dense inverse and by gtsam.Marginals -----------------------
 
-WIDTHS = {ord("k"): 9, ord("l"): 3, ord("t"): 6, ord("x"): 6}
+
+WIDTHS = {ord("k"): NATIVE_SIZE, ord("l"): 3, ord("t"): 6, ord("x"): 6}
 
 
 def calibration_keys(graph: CalibrationGraph) -> list[int]:
@@ -207,7 +196,7 @@ def columns_of(every: list[int], keys: list[int]) -> IntArray:
 
 def to_reported(estimate: Estimate) -> FloatArray:
     """Jacobian from GTSAM's variables at `calibration_keys` to what is reported of them."""
-    lenses = [np.eye(9)[native_slots(camera)] for camera in estimate.cameras]
+    lenses = [np.eye(NATIVE_SIZE)[native_slots(camera)] for camera in estimate.cameras]
     return block_diag(*lenses, *(numeric_reported(t) for t in estimate.cam_from_rig[1:]))
 
 
@@ -230,9 +219,9 @@ def numeric_reported(cam_from_rig: Transform) -> FloatArray:
 def dense_hessian(case: Solved, part: slice, every: list[int]) -> FloatArray:
     """GTSAM's whole Hessian of some of the factors, at the optimum."""
     some = gtsam.NonlinearFactorGraph()
-    for i in range(*part.indices(case.graph.factors.size())):
-        some.push_back(case.graph.factors.at(i))
-    linear = some.linearize(case.values)
+    for i in range(*part.indices(case.reference.factors.size())):
+        some.push_back(case.reference.factors.at(i))
+    linear = some.linearize(case.native)
     inside = [key for key in every if some.keys().count(key)]
     ordering = gtsam.Ordering()
     for key in inside:
@@ -282,11 +271,11 @@ def worst_difference(a: FloatArray, b: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("lens", LENS_NAMES)
+@pytest.mark.parametrize("lens", JUDGED_LENSES)
 def test_the_model_covariance_is_the_dense_inverse(lens: LensName, loss: LossName) -> None:
     """(c H + P)^-1 (s H + P) (c H + P)^-1, everything inverted whole: all cross-covariances."""
     case = solved(lens, loss, weak=True)
-    every = sorted(case.values.keys())
+    every = sorted(case.native.keys())
     n = len(case.graph.problem.observations)
     of_data = dense_hessian(case, slice(n), every)
     of_priors = dense_hessian(case, slice(n, None), every)
@@ -301,12 +290,33 @@ def test_the_model_covariance_is_the_dense_inverse(lens: LensName, loss: LossNam
     assert worst_difference(case.covariance.model.matrix, expected) < 1e-5
 
 
+@pytest.mark.parametrize(("lens", "loss", "baseline"), ALL)
+def test_our_marginals_are_those_of_the_reference(
+    lens: LensName, loss: LossName, baseline: bool
+) -> None:
+    """All sigmas and cross-covariances of lenses and rig, before the loss's moments are in."""
+    case = solved(lens, loss, weak=True, baseline=baseline, near=True)
+    keys = calibration_keys(case.graph)
+    joint = gtsam.Marginals(case.reference.factors, case.native).jointMarginalCovariance(keys)
+    native = np.block([[joint.at(a, b) for b in keys] for a in keys])
+    jacobian = to_reported(case.estimate)
+    expected = jacobian @ native @ jacobian.T
+    with threads() as pool:
+        start = homogeneous(case.graph.tracks, case.estimate.points)
+        state = evaluate(case.graph, case.values, start, pool)
+        system = linearised(case.graph, state, pool)
+    columns, names, to_ours = calibration_columns(case.graph, case.estimate)
+    assert names == case.covariance.model.names
+    ours = to_ours @ responses(case.graph, system, columns)[columns] @ to_ours.T
+    assert worst_difference(ours, expected) < 1e-5
+
+
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("lens", LENS_NAMES)
+@pytest.mark.parametrize("lens", JUDGED_LENSES)
 def test_the_model_covariance_is_that_of_gtsam_marginals(lens: LensName, loss: LossName) -> None:
     case = solved(lens, loss)
     keys = calibration_keys(case.graph)
-    joint = gtsam.Marginals(case.graph.factors, case.values).jointMarginalCovariance(keys)
+    joint = gtsam.Marginals(case.reference.factors, case.native).jointMarginalCovariance(keys)
     native = np.block([[joint.at(a, b) for b in keys] for a in keys])
     curvature, score_variance = hand_made_moments(case)
     jacobian = to_reported(case.estimate)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphs.camera import Camera, project
 from graphs.frames import Transform
-from graphs.lenses import Camera, project
 from graphs.problem import Estimate, Observations, Problem, points_in_cameras, residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.report import TruthRow, write_report

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from graphs.camera import Camera
 from graphs.frames import Transform
-from graphs.lenses import Camera
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import Calibration, load_calibration, save_calibration, truth
 

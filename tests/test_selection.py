@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graphs.camera import Camera, nominal_params
 from graphs.frames import FloatArray, Transform, exp_rotation
-from graphs.lenses import Camera, nominal_params
 from graphs.problem import Estimate, Observations, Problem, residuals_px
-from graphs.selection import (
-    MIN_TRACK_LENGTH,
-    compact,
-    parallax_deg,
-    select_tracks,
-    within_budget,
-)
+from graphs.selection import MIN_TRACK_LENGTH, compact, parallax_deg, select_tracks
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 CAMERA = Camera("cam", "pinhole", (640, 480), nominal_params("pinhole", (640, 480), 500.0))
@@ -112,25 +106,3 @@ def test_compacting_with_everything_seen_changes_nothing() -> None:
     assert again.frame_names == problem.frame_names and again.scale == problem.scale
     np.testing.assert_array_equal(again.initial.points, problem.initial.points)
     np.testing.assert_array_equal(again.observations.frame, problem.observations.frame)
-
-
-def test_a_budget_keeps_whole_long_tracks_all_over_the_images() -> None:
-    problem, _ = simulate_tracks(TrackOptions(frames=10, points=2000), np.random.default_rng(0))
-    whole = problem.observations
-    assert within_budget(problem, len(whole)) is problem
-    budget = len(whole) // 3
-    kept = within_budget(problem, budget)
-    seen = kept.observations
-    assert 0.9 * budget < len(seen) <= budget
-    assert kept.frame_names == problem.frame_names
-    before = {
-        tuple(p): n for p, n in zip(problem.initial.points, np.bincount(whole.point), strict=True)
-    }
-    for point, length in zip(kept.initial.points, np.bincount(seen.point), strict=True):
-        assert before[tuple(point)] == length  # no track is cut
-    assert np.bincount(seen.point).mean() > 1.1 * np.bincount(whole.point).mean()
-    images = seen.frame * 3 + seen.camera
-    corners = np.abs(seen.pixels / [640, 480] - 0.5).min(1) > 0.25
-    assert len(np.unique(images[corners])) == 30  # every image has something far from its middle
-    again = within_budget(problem, budget)
-    np.testing.assert_array_equal(again.observations.pixels, seen.pixels)

@@ -14,8 +14,9 @@ import pytest
 import yaml
 from synthetic.scans import simulation
 
+from graphs.camera import Camera, project, unproject
 from graphs.frames import FloatArray, Transform
-from graphs.lenses import Camera, LensName, project, unproject
+from graphs.lenses import LensName
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate import render as rendering

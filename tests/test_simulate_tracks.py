@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphs.frames import angle_between
-from graphs.lenses import LensName
+from graphs.lenses import LENS_NAMES, LensName
 from graphs.problem import residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import load_calibration
@@ -27,7 +27,7 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-@pytest.mark.parametrize("lens", ["pinhole", "radial", "radtan", "kannala_brandt"])
+@pytest.mark.parametrize("lens", LENS_NAMES)
 def test_true_residuals_have_the_stated_sigma(lens: LensName) -> None:
     options = TRACKS.model_copy(update={"lens": lens, "sigma_px": 0.7})
     problem, true = simulate_tracks(options, rng())

@@ -5,11 +5,13 @@ import itertools
 
 import pytest
 from rich.console import Console
+from synthetic.problems import small_problem
 from test_result import rig
 
 from sfm_calib import terminal
 from sfm_calib.comparison import compare_with_truth
-from sfm_calib.result import Noise, Solve, Verdict, WeakDirection
+from sfm_calib.report.headline import key_figures
+from sfm_calib.result import Noise, Selection, Solve, Verdict, WeakDirection
 from sfm_calib.terminal import print_comparison, print_result, sigma_text, with_digits
 
 
@@ -72,6 +74,19 @@ def test_everything_is_said():
         assert part in text
     assert "NOT USABLE" not in text
     assert "NOT USABLE" in "\n".join(printed(finished(verdict=Verdict(usable=False))))
+
+
+def test_what_a_budget_cost_is_said():
+    chosen = Selection(available=91000, kept=40000, sigma_factor=1.214, worst_sigma_factor=1.4)
+    solve = finished().solve.model_copy(update={"selection": chosen})
+    assert (
+        "40000 of 91000 observations chosen (max_observations): sigmas 1.21 x those of all, at "
+        "worst 1.40 x"
+    ) in printed(finished(solve=solve))
+    assert "max_observations" not in "\n".join(printed(finished()))
+    problem, _ = small_problem()
+    remarks = [figure.remark for figure in key_figures(finished(solve=solve), problem)]
+    assert "of 12,345 scene points; 40,000 of 91,000 were chosen, sigmas × 1.21 for it" in remarks
 
 
 @pytest.mark.parametrize("width", [None, 80])

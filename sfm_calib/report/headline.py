@@ -61,9 +61,15 @@ def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...
     n_points = solve.n_points if solve else len(np.unique(observations.point))
     n_cameras = len(calibration.cameras)
     cameras = "one camera" if n_cameras == 1 else f"{n_cameras} cameras"
+    of_points = f"of {n_points:,} scene points"
+    if solve is not None and (chosen := solve.selection):
+        of_points += (
+            f"; {chosen.kept:,} of {chosen.available:,} were chosen, "
+            f"sigmas × {chosen.sigma_factor:.2f} for it"
+        )
     figures = [
         Figure(f"{n_images:,}", "images used", f"{n_frames:,} frames, {cameras}"),
-        Figure(f"{n_observations:,}", "observations", f"of {n_points:,} scene points"),
+        Figure(f"{n_observations:,}", "observations", of_points),
     ]
     if noise is not None:
         figures.append(Figure(f"{noise.sigma_px:.3f} px", "noise sigma", "robust, one coordinate"))

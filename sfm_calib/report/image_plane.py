@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import plotly.graph_objects as go
 
+from graphs.camera import Camera
 from graphs.frames import FloatArray
-from graphs.lenses import Camera
 from sfm_calib.report.residuals import CameraResiduals
 from sfm_calib.report.theme import (
     AMBER,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
+from graphs.camera import Camera
 from graphs.frames import FloatArray
-from graphs.lenses import Camera
 from graphs.problem import Estimate, IntArray, Problem, residuals_px
 from sfm_calib.report.theme import AMBER, BLUE, INK, MUTED, plain, styled
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import plotly.graph_objects as go
 
+from graphs.camera import Camera, unproject
 from graphs.frames import FloatArray, Transform
-from graphs.lenses import Camera, unproject
 from graphs.problem import Estimate, Problem, residuals_px
 from sfm_calib.report.theme import (
     FONT,

@@ -18,8 +18,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from graphs.camera import Camera, unproject
 from graphs.frames import Transform
-from graphs.lenses import Camera, unproject
 from sfm_calib.simulate.room import Room
 from sfm_calib.simulate.textures import MIP_LEVELS, Float32, Grey
 

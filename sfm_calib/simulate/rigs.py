@@ -12,8 +12,9 @@ from typing import Literal
 
 import numpy as np
 
+from graphs.camera import Camera, fit_lens
 from graphs.frames import FloatArray, Transform, exp_rotation
-from graphs.lenses import PARAMETER_NAMES, Camera, LensName
+from graphs.lenses import PARAMETER_NAMES, LensName
 
 RigName = Literal["mono", "stereo", "triple"]
 TrajectoryName = Literal["handheld", "orbit", "corridor", "panorama", "static"]
@@ -41,6 +42,11 @@ LENSES = (
     LensPreset(545.8, 0.9982, (-5.6, 4.4), (-0.138, 0.034), (-5e-4, 7e-4), (-0.015, 2e-3, 0, 0)),
     LensPreset(523.1, 1.0023, (4.2, 6.8), (-0.187, 0.049), (4e-4, 5e-4), (-0.024, 5e-3, 0.0, 0.0)),
 )
+LIKE: dict[LensName, LensName] = {
+    "division": "radial",
+    "eucm": "kannala_brandt",
+    "double_sphere": "kannala_brandt",
+}
 # Where the cameras sit in the rig's frame (x right, y down, z forward), and how they look:
 # position in m; yaw to the right, pitch up, roll in degrees.
 MOUNTS: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
@@ -72,7 +78,13 @@ def make_rig(
 
 
 def make_camera(name: str, preset: LensPreset, lens: LensName, size: tuple[int, int]) -> Camera:
-    """A camera with the preset's parameters, as far as the lens model has them."""
+    """A camera with the preset's parameters, as far as the lens model has them.
+
+    A lens with other parameters is the nearest to one that has them: to the fisheye if it is for
+    such lenses.
+    """
+    if lens in LIKE:
+        return fit_lens(make_camera(name, preset, LIKE[lens], size), lens)[0]
     scale = size[0] / PRESET_WIDTH
     fx = preset.fx * scale * (FISHEYE_FOCAL if lens == "kannala_brandt" else 1.0)
     cx, cy = ((n - 1) / 2 + d * scale for n, d in zip(size, preset.off_centre, strict=True))
@@ -83,7 +95,7 @@ def make_camera(name: str, preset: LensPreset, lens: LensName, size: tuple[int, 
         values |= dict(
             zip(("k1", "k2", "p1", "p2"), (*preset.radial, *preset.tangential), strict=True)
         )
-    params = np.array([values[parameter] for parameter in PARAMETER_NAMES[lens]])
+    params = np.array([values.get(parameter, 0.0) for parameter in PARAMETER_NAMES[lens]])
     return Camera(name, lens, size, params)
 
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 import sfm_calib
+from graphs.camera import Camera, focal_on_axis, nominal_params, project
 from graphs.frames import FloatArray, Transform
-from graphs.lenses import Camera, LensName, nominal_params, project
+from graphs.lenses import LensName
 from graphs.problem import Estimate, KnownBaseline, Observations, Problem
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
@@ -158,18 +159,19 @@ def _visible(whole: Estimate, options: TrackOptions, rng: np.random.Generator) -
         first_frame[:] = 0
     parts = []
     for frame, placed in enumerate(whole.rig_from_world):
+        running = np.flatnonzero((frame >= first_frame) & (frame < first_frame + run))
+        in_rig = placed @ whole.points[running]
         for index, camera in enumerate(whole.cameras):
-            in_camera = whole.cam_from_rig[index] @ (placed @ whole.points)
+            in_camera = whole.cam_from_rig[index] @ in_rig
             pixels = project(camera, in_camera)
             with np.errstate(invalid="ignore"):
                 seen = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
             seen &= np.linalg.norm(in_camera, axis=1) > NEAREST_M
-            seen &= (frame >= first_frame) & (frame < first_frame + run)
-            rows = np.flatnonzero(seen)
-            if len(rows) > options.max_points_per_image:
-                rows = np.sort(rng.choice(rows, options.max_points_per_image, replace=False))
-            same = np.ones(len(rows), np.int64)
-            parts.append(Observations(pixels[rows], frame * same, index * same, rows))
+            kept = np.flatnonzero(seen)
+            if len(kept) > options.max_points_per_image:
+                kept = np.sort(rng.choice(kept, options.max_points_per_image, replace=False))
+            same = np.ones(len(kept), np.int64)
+            parts.append(Observations(pixels[kept], frame * same, index * same, running[kept]))
     return Observations(
         np.concatenate([part.pixels for part in parts]),
         np.concatenate([part.frame for part in parts]),
@@ -224,9 +226,8 @@ def _perturbed(true: Estimate, options: TrackOptions, rng: np.random.Generator) 
     for camera in true.cameras:
         angle = rng.uniform(0, 2 * np.pi)
         error = options.principal_point_error_px * np.array([np.cos(angle), np.sin(angle)])
-        params = nominal_params(
-            camera.lens, camera.size, float(camera.params[0]) * (1 + options.focal_error)
-        )
+        focal_px = float(focal_on_axis(camera)[0]) * (1 + options.focal_error)
+        params = nominal_params(camera.lens, camera.size, focal_px)
         params[2:4] = camera.params[2:4] + error
         cameras.append(replace(camera, params=params))
     others = tuple(moved(t, baseline_shift) for t in true.cam_from_rig[1:])
@@ -272,7 +273,7 @@ def write_tracks(problem: Problem, true: Estimate, folder: Path) -> None:
         "sizes": np.array([camera.size for camera in cameras]),
         "reference": np.array(problem.reference),
     }
-    if problem.scale:
+    if isinstance(problem.scale, KnownBaseline):
         arrays["scale_cameras"] = np.array(problem.scale.cameras)
         arrays["scale"] = np.array([problem.scale.length_m, problem.scale.sigma_m])
     arrays |= _estimate_arrays("initial", problem.initial) | _estimate_arrays("truth", true)

@@ -1,0 +1,236 @@
+"""The track factor: feature tracks as one smart factor that knows calibration.
+
+Points are not variables. Whenever the factor is evaluated it triangulates them for the frames,
+cam_from_rig and lenses at hand; when it is linearised it eliminates them (variable projection,
+Golub and Pereyra 1973; in bundle adjustment: the Schur complement), so that what is left is a
+quadratic in frames, cam_from_rig and lenses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from graphs.clusters import Cluster, Tracks
+from graphs.frames import FloatArray
+from graphs.lenses import project_many, project_point_many
+from graphs.losses import LOSS_INDEX, weigh_many
+from graphs.points import advance_points, eliminate_points
+from graphs.problem import IntArray
+from graphs.rows import all_rows, carry_points, into_cameras, move_points, point_rows
+
+TRIANGULATION_STEPS = 20
+# Predicted decrease, of a point's cost, at which it is triangulated: its square is below rounding.
+TRIANGULATION_TOLERANCE = 1e-11  # of the cost: next to rounding
+
+
+@dataclass(frozen=True)
+class Variables:
+    """The values of all variables that tracks depend on, as GTSAM holds them."""
+
+    rig_rotation: FloatArray  # (n_frames, 3, 3) world_from_rig
+    rig_centre: FloatArray  # (n_frames, 3)
+    cam_rotation: FloatArray  # (n_cameras, 3, 3) rig_from_cam
+    cam_centre: FloatArray  # (n_cameras, 3)
+    models: IntArray  # (n_cameras,) MODEL_INDEX
+    params: FloatArray  # (n_cameras, n) padded with zeros
+    limits: FloatArray  # (n_cameras,) of the valid region
+
+    def poses(self, frames: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Rotations and centres of these frames and of all cameras, as the kernels take them."""
+        return (
+            self.rig_rotation[frames],
+            self.rig_centre[frames],
+            self.cam_rotation,
+            self.cam_centre,
+        )
+
+    @property
+    def lenses(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Models, parameters and limits, as the kernels take them."""
+        return self.models, self.params, self.limits
+
+
+class Rows(NamedTuple):
+    """Linearised, weighted rows of a chunk, in the order in which the kernels take them."""
+
+    active: IntArray  # (n_active,) points of the cluster
+    begins: IntArray  # (n_points + 1,)
+    rows: IntArray  # (n, 4) observation, point, frame, camera; all of the cluster
+    points: FloatArray  # (n_points, 4)
+    smallest_w: float
+    residuals: FloatArray  # (n, 2)
+    of_point: FloatArray  # (n, 2, 3)
+    of_frame: FloatArray  # (n, 2, 6)
+    of_rig: FloatArray  # (n, 2, 6)
+    of_lens: FloatArray  # (n, 2, n_params)
+    n_frames: int
+
+
+class Scratch:
+    """Arrays for the rows of one chunk, one set a thread."""
+
+    def __init__(self, cluster: Cluster, n_params: int) -> None:
+        n = cluster.most_rows
+        self.rows = np.empty((n, 4), np.int64)
+        self.in_rig, self.in_cam = np.empty((n, 3)), np.empty((n, 3))
+        self.pixels, self.by_point = np.empty((n, 2)), np.empty((n, 2, 3))
+        self.by_params, self.of_point = np.empty((n, 2, n_params)), np.empty((n, 2, 3))
+        self.residuals, self.weights = np.empty((n, 2)), np.empty(n)
+        self.bends, self.costs = np.empty(n), np.empty(n)
+        if n_params:
+            self.of_frame, self.of_rig = np.empty((n, 2, 6)), np.empty((n, 2, 6))
+
+
+def triangulate(
+    tracks: Tracks,
+    variables: Variables,
+    points: FloatArray,
+    pool: ThreadPoolExecutor,
+    tolerance: float = TRIANGULATION_TOLERANCE,
+    before: Variables | None = None,
+) -> tuple[FloatArray, float]:
+    """The points (n_points, 4) that cost least for given variables, from a start; and the cost.
+
+    Each point runs its own Levenberg-Marquardt and is done when a step promises to lower the cost
+    by less than `tolerance`. What cannot be projected costs as much as INVALID_SIGMAS.
+    before: the variables that the start belongs to; points then move along with their cameras.
+    """
+    result = np.array(points)
+
+    def run(cluster: Cluster) -> float:
+        of_cluster = result[cluster.points]
+        return triangulate_cluster(tracks, cluster, variables, of_cluster, tolerance, before)
+
+    return result, float(sum(pool.map(run, tracks.clusters)))
+
+
+def triangulate_cluster(
+    tracks: Tracks,
+    cluster: Cluster,
+    variables: Variables,
+    points: FloatArray,
+    tolerance: float,
+    before: Variables | None = None,
+) -> float:
+    """As `triangulate`, of one cluster, its points (n_points, 4) in place; returns their cost."""
+    poses, s = variables.poses(cluster.frames), Scratch(cluster, 0)
+    if before is not None:
+        carry_points(
+            cluster.begins, cluster.frame, cluster.camera, cluster.anchors,
+            *before.poses(cluster.frames), *poses, points,
+        )  # fmt: skip
+        np.maximum(points[:, 3], tracks.smallest_w, out=points[:, 3])
+    trial, cost = points.copy(), np.full(len(points), np.inf)
+    normal, steps = np.zeros((len(points), 10)), np.empty((len(points), 3))
+    still, waiting = np.empty(len(points), np.int64), np.arange(cluster.n_points)
+    for _ in range(TRIANGULATION_STEPS):
+        going_on = []
+        for active in cluster.chunks(waiting):
+            n = into_cameras(
+                active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, trial,
+                *poses, s.rows, s.in_rig, s.in_cam,
+            )  # fmt: skip
+            camera, row = s.rows[:n, 3], s.rows[:n, 0]
+            project_point_many(
+                *variables.lenses, camera, s.in_cam[:n], s.pixels[:n], s.by_point[:n]
+            )
+            _weigh(tracks, cluster, s, n, row)
+            point_rows(
+                n, s.rows, cluster.anchors, trial, *poses, cluster.root_information,
+                s.by_point, s.of_point,
+            )  # fmt: skip
+            count = advance_points(
+                active, cluster.begins, s.of_point, s.residuals, s.weights, s.bends, s.costs,
+                tracks.smallest_w, tolerance, trial, points, cost, normal, still, steps,
+            )  # fmt: skip
+            on = still[:count].copy()
+            moved = np.empty((count, 4))
+            move_points(points[on], steps[:count], tracks.smallest_w, moved)
+            trial[on] = moved
+            going_on.append(on)
+        waiting = np.concatenate(going_on)
+        if waiting.size == 0:
+            break
+    return float(cost.sum())
+
+
+def _weigh(tracks: Tracks, cluster: Cluster, s: Scratch, n: int, row: IntArray | slice) -> None:
+    weigh_many(
+        LOSS_INDEX[tracks.loss], tracks.loss_scale, s.pixels[:n], cluster.pixels[row],
+        cluster.root_information[row], s.residuals[:n], s.weights[:n], s.bends[:n], s.costs[:n],
+    )  # fmt: skip
+
+
+def linearise(
+    tracks: Tracks,
+    variables: Variables,
+    points: FloatArray,
+    border: int,
+    pool: ThreadPoolExecutor,
+    newton: bool = False,
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Reduced normal equations (H, g) of every cluster: points eliminated, robust weights in.
+
+    H (n, n), upper triangle, and g (n,): columns of the front's frames, six each, then `border`
+    more, the rigs' and lenses' first. The cost's gradient is g, its Gauss-Newton Hessian H, with
+    the loss's weights or, for `newton`, with its curvature as far as that stays positive.
+    """
+
+    def run(cluster: Cluster) -> tuple[FloatArray, FloatArray]:
+        of_cluster = points[cluster.points]
+        return linearise_cluster(tracks, cluster, variables, of_cluster, border, newton)
+
+    return list(pool.map(run, tracks.clusters))
+
+
+def linearise_cluster(
+    tracks: Tracks,
+    cluster: Cluster,
+    variables: Variables,
+    points: FloatArray,
+    border: int,
+    newton: bool = False,
+) -> tuple[FloatArray, FloatArray]:
+    """As `linearise`, of one cluster and its points (n_points, 4)."""
+    size = 6 * len(cluster.frames) + border
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for chunk in rows_of(tracks, cluster, variables, points, newton):
+        eliminate_points(*chunk, *tracks.columns.places, tracks.columns.width, H, g)
+    return H, g
+
+
+def rows_of(
+    tracks: Tracks,
+    cluster: Cluster,
+    variables: Variables,
+    points: FloatArray,
+    newton: bool = False,
+) -> Iterator[Rows]:
+    """The linearised rows of a cluster, chunk by chunk; the next overwrites their arrays."""
+    poses, s = variables.poses(cluster.frames), Scratch(cluster, variables.params.shape[1])
+    for active in cluster.chunks(np.arange(cluster.n_points)):
+        n = into_cameras(
+            active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, points,
+            *poses, s.rows, s.in_rig, s.in_cam,
+        )  # fmt: skip
+        project_many(
+            *variables.lenses, s.rows[:n, 3], s.in_cam[:n], s.pixels[:n], s.by_point[:n],
+            s.by_params[:n],
+        )  # fmt: skip
+        _weigh(tracks, cluster, s, n, slice(int(s.rows[0, 0]), int(s.rows[0, 0]) + n))
+        if not newton:
+            s.bends[:] = 0.0
+        all_rows(
+            n, s.rows, cluster.anchors, points, *poses, cluster.root_information, s.by_point,
+            s.by_params, s.in_rig, s.in_cam, s.weights, s.bends, s.residuals, s.of_point,
+            s.of_frame, s.of_rig,
+        )  # fmt: skip
+        yield Rows(
+            active, cluster.begins, s.rows[:n], points, tracks.smallest_w, s.residuals,
+            s.of_point, s.of_frame, s.of_rig, s.by_params, len(cluster.frames),
+        )  # fmt: skip
