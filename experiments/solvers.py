@@ -68,7 +68,10 @@ def run(solver: SolverName, problem: Path, environment: Mapping[str, str] | None
             command, env={**os.environ, **(environment or {})}, capture_output=True, text=True
         )
         if done.returncode:
-            raise RuntimeError(f"{solver} failed on {problem.name}: {done.stderr[-2000:].strip()}")
+            raise RuntimeError(
+                f"{solver} failed on {problem.name}, exit status {done.returncode}: "
+                f"{done.stderr[-2000:].strip() or 'nothing said'}"
+            )
         return Outcome(**json.loads(written.read_text()))
 
 

@@ -1,11 +1,11 @@
 """Fewer observations that say nearly as much: tracks chosen by their information.
 
 A track's leverage is its share of the information on all lenses and cam_from_rig, everything else
-marginalised; all leverages add up to the number of these unknowns. Tracks with the most leverage
-an observation are kept, as long as they fall where some image still lacks observations. Measured
-with half of the observations, sigmas grow by 1.11 to 1.25 (corridor, fountain, street, a rendered
-room), by 1.13 to 1.41 when the longest tracks are kept, and by 1.33 to 1.41 at random; with a
-tenth by 1.9 to 2.6 instead of 2.4 (or undetermined frames) and 2.8 to 3.3.
+marginalised; without priors, all leverages add up to the number of these unknowns. Tracks with the
+most leverage an observation are kept, as long as they fall where some image still lacks
+observations. Measured with half of the observations, sigmas grow by 1.11 to 1.25 (corridor,
+fountain, street, a rendered room), by 1.13 to 1.41 when the longest tracks are kept, and by 1.33 to
+1.41 at random; with a tenth by 1.9 to 2.6 instead of 2.4 (or undetermined frames) and 2.8 to 3.3.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def within_budget(
 ) -> tuple[Problem, Budget | None]:
     """The problem with at most `max_observations`, and what that costs; None: it has no more.
 
-    Random order breaks no ties: the result is the same every time.
+    Ties keep their order: the result is the same every time. The two ends of a measured distance
+    are kept beyond the number.
     Raises ValueError when the problem, or what is left of it, determines too little.
     """
     seen = problem.observations
@@ -59,7 +60,7 @@ def within_budget(
     if isinstance(problem.scale, KnownSpan):
         keep[list(problem.scale.points)] = True
     chosen = compact(problem, seen.subset(keep[seen.point]))
-    factor = _information(chosen, options)[0] / sigma
+    factor = _information(chosen, options)[0] / sigma if sigma.size else np.ones(1)
     budget = Budget(
         len(seen), len(chosen.observations), float(np.median(factor)), float(factor.max())
     )
@@ -70,6 +71,8 @@ def _information(problem: Problem, options: GraphOptions) -> tuple[FloatArray, F
     """Model sigmas (n,) of lenses and rig at the start, and each point's leverage (n_points,)."""
     graph = build(problem, options)
     columns = np.unique(calibration_columns(graph, problem.initial)[0])  # some lenses are shared
+    if not columns.size:  # everything is held: long tracks tell the frames best
+        return np.empty(0), np.bincount(graph.problem.observations.point).astype(np.float64) ** 2
     variables = graph.variables(graph.initial)
     points = homogeneous(graph.tracks, problem.initial.points)
     with threads() as pool:

@@ -113,6 +113,9 @@ def _check_finite(problem: Problem) -> None:
     for camera in start.cameras:
         if not np.isfinite(camera.params).all():
             raise ValueError(f"{camera.name}: the lens starts at {camera.params.tolist()}")
+    for camera, placed in zip(start.cameras, start.cam_from_rig, strict=True):
+        if not np.isfinite([*placed.rotation.ravel(), *placed.translation]).all():
+            raise ValueError(f"{camera.name} starts nowhere in the rig: not a finite place")
     places = np.array([[*t.rotation.ravel(), *t.translation] for t in start.rig_from_world])
     for index in np.flatnonzero(~np.isfinite(places).all(axis=1)):
         raise ValueError(f"frame {problem.frame_names[index]} starts nowhere: not a finite place")
@@ -136,6 +139,9 @@ def _lens_of(problem: Problem, groups: Sequence[tuple[int, ...]]) -> tuple[int, 
     """The camera whose lens variable each camera uses."""
     cameras = problem.initial.cameras
     lens_of = list(range(len(cameras)))
+    everyone = [camera for group in groups for camera in group]
+    if len(set(everyone)) < len(everyone):
+        raise ValueError("a camera is in two groups that share a lens: put both into one")
     for group in groups:
         for camera in group:
             first, other = cameras[group[0]], cameras[camera]

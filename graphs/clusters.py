@@ -21,7 +21,7 @@ from graphs.problem import IntArray, Problem
 CHUNK = 2048  # observations a chunk: its scratch stays in the second-level cache
 # A large front's tracks are cut, so that threads share them, into at most so many matrices.
 MOST_PARTS = 8
-MOST_PARTS_BYTES = 2**27
+MOST_PARTS_BYTES = 2**30
 PART_OBSERVATIONS = 10_000
 
 
@@ -175,7 +175,7 @@ def _cuts(front: IntArray, begins: IntArray, elimination: Elimination) -> Iterat
     edges = [*np.flatnonzero(np.diff(front, prepend=-1)).tolist(), len(front)]
     for first, last in itertools.pairwise(edges):
         size = len(elimination.columns(elimination.fronts[front[first]]))
-        room = max(MOST_PARTS_BYTES // (8 * size * size), 2)
+        room = max(MOST_PARTS_BYTES // (8 * size * size), 1)
         observations = int(begins[last] - begins[first])
         parts = int(np.clip(observations // PART_OBSERVATIONS, 1, min(room, MOST_PARTS)))
         goal = begins[first] + np.arange(1, parts) * (observations / parts)

@@ -21,7 +21,7 @@ import scipy.linalg
 
 from graphs.build import CalibrationGraph
 from graphs.clusters import Cluster, homogeneous
-from graphs.elimination import NotPositiveDefiniteError
+from graphs.elimination import SINGULAR_PIVOT, NotPositiveDefiniteError
 from graphs.frames import FloatArray, reported_from_tangent
 from graphs.gauge import undetermined
 from graphs.keys import lens_key, rig_key
@@ -37,7 +37,7 @@ POSE_NAMES = (
     *(f"translation_{axis}" for axis in "xyz"),
 )
 # A smaller pivot has the system examined for directions that nothing determines; in real scans the
-# smallest are 1e-6, without a gauge they end at 1e-12 to 1e-15.
+# smallest are 1e-6. Without the gauge's distance it is 1e-12, though an eigenvalue is 1e-15.
 SUSPICIOUS_PIVOT = 1e-8
 MIN_CLUSTERS = 5  # fewer frames cannot show how much frames differ
 
@@ -70,7 +70,9 @@ class CalibrationCovariance:
 
     @property
     def inflation(self) -> float:
-        """Median of stated over model sigma."""
+        """Median of stated over model sigma; 1 where nothing is estimated."""
+        if not self.model.names:
+            return 1.0
         ratio = np.diag(self.stated.matrix) / np.diag(self.model.matrix)
         return float(np.median(np.sqrt(ratio)))
 
@@ -89,6 +91,9 @@ def calibration_covariance(
     points = homogeneous(graph.tracks, estimate.points)
     others = graph.others.linearize(values)
     columns, names, to_reported = calibration_columns(graph, estimate)
+    if not columns.size:  # everything is held
+        nothing = Covariance((), np.zeros((0, 0)))
+        return CalibrationCovariance(nothing, nothing)
     with threads() as pool:
         system = assemble(
             graph.tracks, others, graph.layout, variables, points, pool, moments.curvature
@@ -114,11 +119,14 @@ def responses(graph: CalibrationGraph, system: System, columns: IntArray) -> Flo
     unit[columns, np.arange(len(columns))] = 1.0
     try:
         factor = system.factorise()
-        smallest = factor.smallest_pivot()[0]
-    except NotPositiveDefiniteError:
-        smallest = 0.0
-    if smallest < SUSPICIOUS_PIVOT and (why := undetermined(graph.problem, graph.layout, system)):
-        raise ValueError(why)
+        smallest, column = factor.smallest_pivot()
+    except NotPositiveDefiniteError as error:
+        factor, smallest, column = None, 0.0, error.column
+    if smallest < SUSPICIOUS_PIVOT:
+        weakest = column if smallest < SINGULAR_PIVOT else None
+        if why := undetermined(graph.problem, graph.layout, system, weakest):
+            raise ValueError(why)
+    assert factor is not None  # else a column was to blame
     return factor.solve(unit)
 
 
@@ -206,18 +214,20 @@ class ClusterSums:
 
     def variance(self) -> FloatArray:
         """Variances (n,), each count n of clusters corrected by n / (n - 1)."""
-        by_frame = (self.by_frame**2).sum(0) * _spread(len(self.by_frame))
-        by_track = self.by_track * _spread(self.n_tracks)
-        by_both = self.by_both * _spread(self.n_both)
+        by_frame = (self.by_frame**2).sum(0) * _finite(int(self.by_frame.any(axis=1).sum()))
+        by_track = self.by_track * _finite(self.n_tracks)
+        by_both = self.by_both * _finite(self.n_both)
         return np.maximum(by_frame + by_track - by_both, np.maximum(by_frame, by_track))
 
 
-def _spread(count: int) -> float:
+def _finite(count: int) -> float:
+    """Correction of a sum over so many clusters for their common mean."""
     return count / max(count - 1, 1)
 
 
 def _widen(model: FloatArray, variance: FloatArray) -> FloatArray:
-    factor = np.sqrt(np.maximum(variance / np.diag(model), 1.0))
+    known = np.maximum(np.diag(model), 1e-300)  # what priors alone decide may round below zero
+    factor = np.sqrt(np.maximum(variance / known, 1.0)) if len(model) else np.ones(0)
     return model * factor[:, None] * factor[None, :]
 
 
@@ -242,4 +252,5 @@ def calibration_columns(
         columns += layout.columns(rig_key(index)).tolist()
         names += [f"{camera.name}.{name}" for name in POSE_NAMES]
         blocks.append(reported_from_tangent(estimate.cam_from_rig[index]))
-    return np.array(columns), tuple(names), scipy.linalg.block_diag(*blocks)
+    jacobian = scipy.linalg.block_diag(*blocks) if columns else np.zeros((0, 0))
+    return np.array(columns, dtype=np.int64), tuple(names), jacobian

@@ -10,7 +10,9 @@ remains there is the information of the calibration itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -181,6 +183,14 @@ class Cholesky:
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """H^-1 rhs for rhs (n_columns,) or (n_columns, n_rhs)."""
+        with _blas_threads([len(pivot) + len(below) for pivot, below in self._steps]):
+            return self._solve(rhs)
+
+    @property
+    def _steps(self) -> list[tuple[FloatArray, FloatArray]]:
+        return list(zip(self.pivots, self.below, strict=False))
+
+    def _solve(self, rhs: FloatArray) -> FloatArray:
         x = np.array(rhs.reshape(len(rhs), -1) * self.scale[:, None], order="F")
         plan = self.elimination
         steps = list(zip(plan.fronts, self.pivots, self.below, strict=False))
@@ -224,13 +234,18 @@ def factorise(
     it). Raises NotPositiveDefiniteError.
     """
     scale = _unit_scale(elimination, matrices, border)
-    largest = max((len(matrix) for matrix in matrices), default=0)
-    with BLAS.limit(limits=1 if largest <= ONE_THREAD_COLUMNS else None, user_api="blas"):
+    with _blas_threads([len(matrix) for matrix in matrices]):
         pivots, belows, root = _eliminate_frames(elimination, matrices, border, scale, damping)
     if elimination.border:
         first = elimination.n_columns - elimination.border
         pivots.append(_pivot(root, damping, np.arange(first, elimination.n_columns)))
     return Cholesky(elimination, scale, tuple(pivots), tuple(belows))
+
+
+def _blas_threads(sizes: Sequence[int]) -> AbstractContextManager[Any]:
+    """One thread for small fronts; all of them where there is a large one."""
+    one = max(sizes, default=0) <= ONE_THREAD_COLUMNS
+    return BLAS.limit(limits=1 if one else None, user_api="blas")
 
 
 def null_directions(

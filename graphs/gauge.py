@@ -13,7 +13,8 @@ from graphs.keys import frame_key, lens_key, rig_key
 from graphs.problem import Problem
 from graphs.system import Layout, System
 
-GAUGE_SIGMA = 1e-6  # of the scene's size, and in radians: far below any estimated sigma
+GAUGE_SIGMA = 1e-6  # of the scene's size, and in radians: moves nothing that is measured
+REFERENCE_SIGMA = 1e-9  # of the rig's size, and in radians: enters the sigma of a baseline
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,7 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     held = gtsam.noiseModel.Diagonal.Sigmas(np.array([GAUGE_SIGMA] * 3 + [sigma] * 3), NOT_SMART)
     pose = to_gtsam_inverse(problem.initial.rig_from_world[gauge.frame])
     graph.add(gtsam.PriorFactorPose3(frame_key(gauge.frame), pose, held))
-    identity = to_gtsam_inverse(Transform.identity())
-    graph.add(gtsam.PriorFactorPose3(rig_key(problem.reference), identity, held))
+    graph.add(hold_reference(problem, gauge))
     if problem.scale is not None:
         return
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
@@ -66,10 +66,24 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     graph.add(gtsam.RangeFactorPose3(key(pair[0]), key(pair[1]), gauge.distance, noise))
 
 
-def undetermined(problem: Problem, layout: Layout, system: System) -> str | None:
+def hold_reference(problem: Problem, gauge: Gauge) -> gtsam.NonlinearFactor:
+    """The reference camera at the identity, for factors that ask where it is: a baseline."""
+    centres = [t.inverse.translation for t in problem.initial.cam_from_rig]
+    size = max(float(np.linalg.norm(c - centres[problem.reference])) for c in centres)
+    sigma = REFERENCE_SIGMA * (size or gauge.distance)
+    sigmas = np.array([REFERENCE_SIGMA] * 3 + [sigma] * 3)
+    identity = to_gtsam_inverse(Transform.identity())
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas, NOT_SMART)
+    return gtsam.PriorFactorPose3(rig_key(problem.reference), identity, noise)
+
+
+def undetermined(
+    problem: Problem, layout: Layout, system: System, weakest: int | None = None
+) -> str | None:
     """One line on what nothing in the system determines: the variables and the remedy.
 
     With the gauge held, theory leaves no direction of zero curvature; None: there is none.
+    weakest: a column whose pivot is zero but for rounding.
     """
     start = layout.elimination.n_columns - layout.elimination.border
     try:
@@ -77,7 +91,9 @@ def undetermined(problem: Problem, layout: Layout, system: System) -> str | None
     except NotPositiveDefiniteError as error:
         return f"the scan does not determine {_name(problem, layout, error.column)}: {REMEDY}"
     if directions.shape[1] == 0:
-        return None
+        if weakest is None:
+            return None
+        return f"the scan does not determine {_name(problem, layout, weakest)}: {REMEDY}"
     largest = np.abs(directions).max(1)
     involved = start + np.flatnonzero(largest > INVOLVED * largest.max())
     names = list(dict.fromkeys(_name(problem, layout, int(column)) for column in involved))

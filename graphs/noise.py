@@ -20,11 +20,12 @@ SMALLEST_SIGMA_PX = 1e-3
 
 def free_dimensions(problem: Problem) -> int:
     """How many numbers the observations have to determine: unknowns less gauge."""
-    start = problem.initial
+    start, seen = problem.initial, problem.observations
+    frames, points = len(np.unique(seen.frame)), len(np.unique(seen.point))
     lenses = sum(camera.params.size for camera in start.cameras)
     gauge = 7 if problem.scale is None else 6
     rig = 6 * (len(start.cameras) - 1)
-    return lenses + rig + 6 * len(start.rig_from_world) + 3 * len(start.points) - gauge
+    return lenses + rig + 6 * frames + 3 * points - gauge
 
 
 def redundancy(problem: Problem) -> float:
@@ -104,7 +105,7 @@ def student_t(lengths: FloatArray, iterations: int = 100) -> tuple[float, float]
     sqrt(freedom + 2) on residuals in units of `scale` sqrt(freedom / (freedom + 2)).
     """
     s = lengths[np.isfinite(lengths)] ** 2
-    scale2, freedom = float(np.median(s)) / RAYLEIGH_MEDIAN**2, 4.0
+    scale2, freedom = max(float(np.median(s)) / RAYLEIGH_MEDIAN**2, SMALLEST_SIGMA_PX**2), 4.0
     for _ in range(iterations):
         before = scale2, freedom
         weight = (freedom + 2) / (freedom + s / scale2)

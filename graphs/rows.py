@@ -1,6 +1,6 @@
 """The linearised rows of tracks: how each residual moves with its point, frame, camera and lens.
 
-A point is homogeneous about a fixed anchor near the cameras that see it: x = anchor + d / w with a
+A point is homogeneous about a fixed anchor, where a camera started: x = anchor + d / w with a
 unit bearing d and an inverse distance w > 0, so that far points are as harmless as near ones. It
 moves by two angles (`bearing_basis`) and the inverse distance. Frames and cameras move as GTSAM's
 Pose3 does: world_from_rig and rig_from_cam, on the right, rotation first.

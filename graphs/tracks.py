@@ -24,8 +24,7 @@ from graphs.problem import IntArray
 from graphs.rows import all_rows, carry_points, into_cameras, move_points, point_rows
 
 TRIANGULATION_STEPS = 20
-# Predicted decrease, of a point's cost, at which it is triangulated: its square is below rounding.
-TRIANGULATION_TOLERANCE = 1e-11  # of the cost: next to rounding
+TRIANGULATION_TOLERANCE = 1e-11  # predicted decrease of the cost, in half squared sigmas
 
 
 @dataclass(frozen=True)
