@@ -145,14 +145,15 @@ def clustered_variance(
     n_frames, n = len(graph.problem.frame_names), response.shape[1]
 
     def run(cluster: Cluster) -> ClusterSums:
-        sums = ClusterSums(n_frames, n)
+        sums = ClusterSums(len(cluster.frames), n)
         for frame, begins, moved, _ in influences(graph, cluster, variables, points, response):
             sums.add(moved, frame, begins)
         return sums
 
     total = ClusterSums(n_frames, n)
-    for sums in pool.map(run, graph.tracks.clusters):
-        total.merge(sums)
+    clusters = graph.tracks.clusters
+    for cluster, sums in zip(clusters, pool.map(run, clusters), strict=True):
+        total.merge(sums, cluster.frames)
     return total.variance()
 
 
@@ -163,8 +164,8 @@ def influences(
     points: FloatArray,
     response: FloatArray,
 ) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
-    """Chunk by chunk: the frame of each observation, where tracks begin, how far each residual
-    moves the unknowns (n_obs, n), and each track's squared response (n_tracks,)."""
+    """Chunk by chunk: the frame of each observation among the cluster's, where tracks begin, how
+    far each residual moves the unknowns (n_obs, n), each track's squared response (n_tracks,)."""
     layout, n = graph.layout, response.shape[1]
     start = 6 * len(layout.elimination.order)
     frames = 6 * cluster.frames[:, None] + np.arange(6)
@@ -182,7 +183,7 @@ def influences(
             chunk.active, chunk.begins, chunk.points, chunk.smallest_w, chunk.residuals,
             chunk.of_point, of_rows, moved, leverage,
         )  # fmt: skip
-        yield cluster.frames[chunk.rows[:, 2]], begins - begins[0], moved, leverage
+        yield chunk.rows[:, 2], begins - begins[0], moved, leverage
 
 
 class ClusterSums:
@@ -195,18 +196,19 @@ class ClusterSums:
 
     def add(self, moved: FloatArray, frame: IntArray, begins: IntArray) -> None:
         """Observations in the order of their tracks, which begin at `begins`, then of frames."""
-        np.add.at(self.by_frame, frame, moved)
         starts_track = np.zeros(len(moved), dtype=bool)
         starts_track[begins] = True
         both = np.flatnonzero(starts_track | (np.diff(frame, prepend=-1) != 0))
         self.by_track += (np.add.reduceat(moved, begins) ** 2).sum(0)
-        self.by_both += (np.add.reduceat(moved, both) ** 2).sum(0)
+        in_frames = np.add.reduceat(moved, both)
+        np.add.at(self.by_frame, frame[both], in_frames)
+        self.by_both += (in_frames**2).sum(0)
         self.n_tracks += len(begins)
         self.n_both += len(both)
 
-    def merge(self, other: ClusterSums) -> None:
-        """Add what other tracks moved."""
-        self.by_frame += other.by_frame
+    def merge(self, other: ClusterSums, frames: IntArray) -> None:
+        """Add what other tracks moved; `frames`: which of ours theirs are."""
+        self.by_frame[frames] += other.by_frame
         self.by_track += other.by_track
         self.by_both += other.by_both
         self.n_tracks += other.n_tracks

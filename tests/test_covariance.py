@@ -232,7 +232,7 @@ def test_sums_over_clusters_by_hand() -> None:
     for rows in (slice(0, 3), slice(3, 5)):
         one = ClusterSums(2, 1)
         one.add(moved[rows], frame[rows], np.array([0]))
-        apart.merge(one)
+        apart.merge(one, np.arange(2))
     np.testing.assert_allclose(apart.variance(), [expected])
 
 
