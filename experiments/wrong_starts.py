@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -111,5 +112,13 @@ def main(kinds: Sequence[Kind] = KINDS, seeds: int = SEEDS) -> list[float]:
     return shares
 
 
+@dataclass(frozen=True)
+class Options:
+    """Does the solver find the optimum from a badly wrong lens?"""
+
+    seeds: int = SEEDS
+    """Scans of each kind."""
+
+
 if __name__ == "__main__":
-    main()
+    main(seeds=tyro.cli(Options).seeds)

@@ -254,6 +254,8 @@ def first_problem(error: ValidationError, spell: Callable[[str], str] = str) -> 
     is_number = isinstance(value, int | float)
     if "[key]" in problem["loc"] or (problem["type"] == "string_type" and is_number):
         return f"{where}: the name {value!r} is a {type(value).__name__}; put it in quotes"
+    if problem["type"] == "tuple_type":
+        return f"{where}: takes a list, like [a, b] (got {value!r})"
     message = problem["msg"].removeprefix("Value error, ")
     shown = f" (got {value!r})" if isinstance(value, str | int | float | bool) else ""
     return f"{where}: {message}{shown}"

@@ -77,6 +77,11 @@ def _check_shared_lenses(config: RigConfig, scan: Scan) -> None:
     """Who shares a lens must have the same model and image size, and share it once."""
     grouped: list[str] = []
     for group in config.shared_lenses:
+        if len(group) < 2:
+            raise CalibrationError(
+                f"shared_lenses: a group of {len(group)} ({', '.join(group)}) shares nothing; name "
+                "two cameras or more, as [[left, right]]"
+            )
         for name in group:
             if name not in scan.cameras:
                 raise CalibrationError(

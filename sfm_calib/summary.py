@@ -83,7 +83,7 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
     entries = {}
     for index, camera in enumerate(run.refinement.estimate.cameras):
         own = {p: sigma.get(f"{camera.name}.{p}", 0.0) for p in camera.names}
-        prior = graph.lens_priors[index]
+        prior = graph.lens_priors[graph.layout.lens_of[index]]
         prior_sigma = np.sqrt(np.diag(np.linalg.inv(prior.information())))
         share = {
             p: min(own[p] ** 2 / float(s) ** 2, 1.0) if free else 1.0

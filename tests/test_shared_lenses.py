@@ -60,6 +60,7 @@ def scan_of(*sizes: tuple[int, int]) -> Scan:
         ({"shared_lenses": [["cam0", "cam9"]]}, "no camera 'cam9'"),
         ({"shared_lenses": [["cam0", "cam1"], ["cam1", "cam2"]]}, "names cam1 twice"),
         ({"shared_lenses": [["cam0", "cam0"]]}, "names cam0 twice"),
+        ({"shared_lenses": [["cam0"]]}, "a group of 1 .*shares nothing"),
         ({"shared_lenses": [["cam0", "cam2"]]}, "320 x 240 px.* cannot share"),
         (
             {"shared_lenses": [["cam0", "cam1"]], "cameras": {"cam1": {"lens": "pinhole"}}},
