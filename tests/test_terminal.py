@@ -80,8 +80,8 @@ def test_what_a_budget_cost_is_said():
     chosen = Selection(available=91000, kept=40000, sigma_factor=1.214, worst_sigma_factor=1.4)
     solve = finished().solve.model_copy(update={"selection": chosen})
     assert (
-        "40000 of 91000 observations chosen (max_observations): model sigmas 1.21 x those of all, at "
-        "worst 1.40 x"
+        "40000 of 91000 observations chosen (max_observations): model sigmas 1.21 x those of "
+        "all, at worst 1.40 x"
     ) in printed(finished(solve=solve))
     assert "max_observations" not in "\n".join(printed(finished()))
     problem, _ = small_problem()
