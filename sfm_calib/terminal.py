@@ -119,7 +119,8 @@ def print_result(calibration: Calibration, console: Console) -> None:
         _print_line(
             console,
             f"{chosen.kept} of {chosen.available} observations chosen (max_observations): model "
-            f"sigmas {chosen.sigma_factor:.2f} x those of all, at worst {chosen.worst_sigma_factor:.2f} x",
+            f"sigmas {chosen.sigma_factor:.2f} x those of all, at worst "
+            f"{chosen.worst_sigma_factor:.2f} x",
         )
     for weak in verdict.weak if verdict else ():
         _print_line(console, f"weak: {weak.what} is decided by its prior; {weak.remedy}")
