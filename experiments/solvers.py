@@ -25,11 +25,11 @@ import numpy as np
 
 from experiments.scans import SIGMA_PX, Size, simulated
 from graphs.build import GraphOptions, build
-from graphs.covariance import calibration_covariance
 from graphs.frames import FloatArray
 from graphs.priors import LensPrior
 from graphs.problem import Estimate, Problem, residuals_px
 from graphs.solve import RELATIVE_COST_TOLERANCE, solve
+from graphs.stated_covariance import calibration_covariance
 
 SolverName = Literal["ours", "ceres", "gtsam"]
 MB = 1e6

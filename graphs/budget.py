@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from graphs.build import GraphOptions, build
 from graphs.clusters import homogeneous
-from graphs.covariance import calibration_columns, influences, responses
 from graphs.frames import FloatArray
+from graphs.influence import influences, responses
+from graphs.model_covariance import calibration_columns
 from graphs.problem import IntArray, KnownSpan, Problem
 from graphs.selection import compact
 from graphs.solve import threads
@@ -85,7 +86,7 @@ def _information(problem: Problem, options: GraphOptions) -> tuple[FloatArray, F
     root = np.linalg.cholesky(covariance / np.outer(scale, scale))
     whitened: FloatArray = scipy.linalg.solve_triangular(root, (response / scale).T, lower=True).T
     parts = [
-        part[3]
+        part.leverage
         for cluster in graph.tracks.clusters
         for part in influences(graph, cluster, variables, points, whitened)
     ]

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphs.frames import FloatArray, Transform, log_rotation
-from graphs.problem import Observations
+from graphs.problem import joined
 from graphs.rig_start import FreeModel, median_transform
 
 MIN_FRAMES = 4  # three motions: two to solve, one to notice
@@ -102,12 +102,7 @@ def _merged(
             poses[camera, frame] = cam_from_world.scaled(scale) @ world_other_from_main
     points = world_other_from_main.inverse @ (other.points * scale)
     a, b = main.observations, other.observations.subset(np.isin(other.observations.camera, news))
-    together = Observations(
-        np.concatenate([a.pixels, b.pixels]),
-        np.concatenate([a.frame, b.frame]),
-        np.concatenate([a.camera, b.camera]),
-        np.concatenate([a.point, b.point + len(main.points)]),
-    )
+    together = joined([a, replace(b, point=b.point + len(main.points))])
     cameras = tuple(
         other.cameras[i] if i in news else camera for i, camera in enumerate(main.cameras)
     )

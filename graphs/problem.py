@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,15 +23,42 @@ class Observations:
     camera: IntArray  # (n_obs,) index into Estimate.cameras
     point: IntArray  # (n_obs,) index into Estimate.points
     relative_sigma: FloatArray | None = None  # (n_obs,) of each pixel's noise; None: all the same
+    feature_scale: FloatArray | None = None  # (n_obs,) size of each keypoint in px; NaN: unknown
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def subset(self, keep: NDArray[np.bool_]) -> Observations:
-        sigma = None if self.relative_sigma is None else self.relative_sigma[keep]
-        return Observations(
-            self.pixels[keep], self.frame[keep], self.camera[keep], self.point[keep], sigma
+        sigma, scale = (
+            None if each is None else each[keep]
+            for each in (self.relative_sigma, self.feature_scale)
         )
+        return Observations(
+            self.pixels[keep], self.frame[keep], self.camera[keep], self.point[keep], sigma, scale
+        )
+
+
+def joined(parts: Sequence[Observations]) -> Observations:
+    """All observations of several sets, one set after the other."""
+
+    def column(name: str, missing: float) -> FloatArray | None:
+        given = [getattr(part, name) for part in parts]
+        if all(one is None for one in given):
+            return None
+        filled = (
+            np.full(len(part), missing) if one is None else one
+            for part, one in zip(parts, given, strict=True)
+        )
+        return np.concatenate(list(filled))
+
+    return Observations(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.frame for part in parts]),
+        np.concatenate([part.camera for part in parts]),
+        np.concatenate([part.point for part in parts]),
+        column("relative_sigma", 1.0),
+        column("feature_scale", np.nan),
+    )
 
 
 @dataclass(frozen=True)

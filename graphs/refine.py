@@ -15,9 +15,12 @@ from graphs.frames import FloatArray
 from graphs.losses import SCALE_95, LossName
 from graphs.noise import (
     SMALLEST_SIGMA_PX,
+    NoiseClass,
     adapted,
+    noise_classes,
     residual_lengths,
     robust_sigma_px,
+    with_class_sigmas,
     with_click_sigma,
 )
 from graphs.problem import Estimate, KnownSpan, Problem, points_in_cameras, residuals_px
@@ -49,6 +52,7 @@ class Refinement:
     summary: SolveSummary
     iterations: int  # of all rounds
     sigma_px: float
+    noise: tuple[NoiseClass, ...]
     n_rejected: int
     budget: Budget | None  # of observations, where there were more than it allows
 
@@ -81,7 +85,8 @@ def refine(
     for number, tolerance in enumerate(ROUND_TOLERANCES):
         if number > 0:
             problem = without_mismatches(problem, min_parallax_deg)
-        sigma_px = noise_of(problem)
+            problem = with_class_sigmas(problem, residuals(problem), options)
+        sigma_px = noise_of(problem, options)
         last = number == len(ROUND_TOLERANCES) - 1
         weighed = replace(options if last else rough, sigma_px=sigma_px)
         if last and adaptive:
@@ -100,13 +105,17 @@ def refine(
         iterations += summary.iterations
         problem = replace(problem, initial=estimate)
     rejected = before - n_unused - len(problem.observations)
-    final = robust_sigma_px(problem, residuals(problem))
-    return Refinement(graph, estimate, values, summary, iterations, final, rejected, budget)
+    left = residuals(problem)
+    return Refinement(
+        graph, estimate, values, summary, iterations,
+        robust_sigma_px(problem, left, options), noise_classes(problem, left, options),
+        rejected, budget,
+    )  # fmt: skip
 
 
-def noise_of(problem: Problem) -> float:
+def noise_of(problem: Problem, options: GraphOptions | None = None) -> float:
     """Robust sigma of the residuals at the problem's start."""
-    return max(robust_sigma_px(problem, residuals(problem)), SMALLEST_SIGMA_PX)
+    return max(robust_sigma_px(problem, residuals(problem), options), SMALLEST_SIGMA_PX)
 
 
 def without_mismatches(problem: Problem, min_parallax_deg: float) -> Problem:

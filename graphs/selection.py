@@ -21,16 +21,20 @@ from graphs.problem import (
 MIN_TRACK_LENGTH = 3  # two views of a point cannot show that one is wrong
 
 
+class NoParallaxError(ValueError):
+    """No point is seen from places far enough apart."""
+
+
 def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
     """Leave out short tracks and points without parallax, and frames that see nothing then.
 
-    Raises ValueError when nothing is left.
+    Raises NoParallaxError when nothing is left.
     """
     seen = problem.observations
     length = np.bincount(seen.point, minlength=len(problem.initial.points))
     keep = (length >= MIN_TRACK_LENGTH) & (parallax_deg(problem) >= min_parallax_deg)
     if not keep.any():
-        raise ValueError(
+        raise NoParallaxError(
             f"none of {len(length)} points is seen {MIN_TRACK_LENGTH} times with "
             f"{min_parallax_deg:g} deg of parallax: move the camera sideways, closer to things"
         )

@@ -25,6 +25,8 @@ RELATIVE_COST_TOLERANCE = 1e-9
 
 # Levenberg-Marquardt's damping, of the diagonal: Nielsen's rule (IMM-REP-1999-05).
 FIRST_DAMPING = 1e-4
+# Near the optimum: in real scans parameters trade against each other to 1e-5 of the diagonal.
+NEAR_DAMPING = 1e-8
 LEAST_GAIN = 1e-3  # of the predicted decrease: a step that brings less is refused
 
 # Relative gain of a step below which the loss's true curvature is used: before, it overshoots.
@@ -65,8 +67,11 @@ def solve(
     max_iterations: int = 100,
     relative_tolerance: float = RELATIVE_COST_TOLERANCE,
     on_iteration: Callable[[int, float], None] | None = None,
+    near: bool = False,
 ) -> tuple[Estimate, gtsam.Values, SolveSummary]:
     """Levenberg-Marquardt from the graph's start, points eliminated.
+
+    near: the start is near the optimum, and the loss's true curvature may be used at once.
 
     Returns the estimate, the same as GTSAM values (for `covariance`), and a summary. An iteration
     is one trial step, accepted or not.
@@ -75,7 +80,8 @@ def solve(
         start = homogeneous(graph.tracks, graph.problem.initial.points)
         state = evaluate(graph, graph.initial, start, pool, np.inf)
         initial_cost, reason = state.cost, f"stopped after {max_iterations} iterations"
-        damping, growth, system, near, idle = FIRST_DAMPING, 2.0, None, False, False
+        damping, growth = NEAR_DAMPING if near else FIRST_DAMPING, 2.0
+        system, idle = None, False
         iteration = 0
         for iteration in range(1, max_iterations + 1):
             if system is None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphs.covariance import Covariance
+from graphs.frames import FloatArray
 from graphs.problem import Estimate
 
 # A baseline that is not ten of its own sigmas long gives no unit.
@@ -22,12 +25,12 @@ def baseline_unit(estimate: Estimate, reference: int, covariance: Covariance) ->
     return far if lengths[far] > MIN_BASELINE_SIGMAS * float(np.linalg.norm(sigma)) else None
 
 
-def in_unit_baseline(covariance: Covariance, estimate: Estimate, far: int) -> Covariance:
-    """The covariance of translations divided by the length of camera `far`'s translation.
+def unit_jacobian(names: Sequence[str], estimate: Estimate, far: int) -> FloatArray:
+    """Derivative (n, n) of parameters, translations over camera `far`'s length, by themselves.
 
     d(t / |b|) = dt / |b| - t (b . db) / |b|^3 for each camera's t, with b that of `far`.
     """
-    index = {name: place for place, name in enumerate(covariance.names)}
+    index = {name: place for place, name in enumerate(names)}
     b = estimate.cam_from_rig[far].translation
     length = float(np.linalg.norm(b))
     jacobian = np.eye(len(index))
@@ -38,4 +41,10 @@ def in_unit_baseline(covariance: Covariance, estimate: Estimate, far: int) -> Co
         rows = [index[f"{camera.name}.translation_{axis}"] for axis in "xyz"]
         jacobian[np.ix_(rows, rows)] /= length
         jacobian[np.ix_(rows, of_far)] -= np.outer(transform.translation, b) / length**3
+    return jacobian
+
+
+def in_unit_baseline(covariance: Covariance, estimate: Estimate, far: int) -> Covariance:
+    """The covariance of translations divided by the length of camera `far`'s translation."""
+    jacobian = unit_jacobian(covariance.names, estimate, far)
     return Covariance(covariance.names, jacobian @ covariance.matrix @ jacobian.T)

@@ -9,10 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from graphs.build import GraphOptions
-from graphs.covariance import CalibrationCovariance, calibration_covariance
+from graphs.ladder import Ladder, climb, on_rung_of
 from graphs.losses import SCALE_95, LossName
+from graphs.motion import too_little_motion
 from graphs.problem import Problem
 from graphs.refine import Refinement, refine
+from graphs.selection import NoParallaxError
+from graphs.split_check import SplitCheck, split_check
+from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
+from graphs.twin import Certificate, certify
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
@@ -23,12 +28,14 @@ from sfm_calib.nominal import (
     known_cameras,
     lens_of,
     lens_priors,
+    on_ladder,
     rig_priors,
     shared_lenses,
     start_from_config,
 )
 from sfm_calib.result import Calibration
-from sfm_calib.summary import Run, summarise
+from sfm_calib.run import Run
+from sfm_calib.summary import summarise
 
 
 @dataclass
@@ -69,44 +76,110 @@ def calibrate(
     lenses = [lens_of(config, name, len(scan.cameras)) for name in scan.cameras]
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
+    problem = start_from_config(mapped.problem, config)
+    with watch.stage("choosing the lens"):
+        ladder = choose_lens(problem, config, progress)
     with watch.stage("solving"):
-        problem = start_from_config(mapped.problem, config)
-        refinement = solve_problem(problem, config, progress)
+        refinement = solve_problem(problem, config, progress, ladder)
     with watch.stage("covariance"):
-        progress("covariance", 0, 0)
-        covariance = covariance_of(refinement)
-    run = Run(scan, config, mapped, refinement, covariance, watch.seconds, command)
+        covariance, split = covariance_of(refinement, config, progress)
+    with watch.stage("certificate"):
+        certificate = certificate_of(refinement, config, progress)
+    run = Run(
+        scan, config, mapped, refinement, covariance, watch.seconds, command,
+        ladder, split, certificate,
+    )  # fmt: skip
     calibration, unit = summarise(run)
     return Outcome(calibration, refinement, unit)
 
 
-def solve_problem(problem: Problem, config: RigConfig, progress: Progress) -> Refinement:
-    """The graph's optimum under the configuration's priors."""
-    adaptive = config.loss == "adaptive"
+def options_of(problem: Problem, config: RigConfig) -> GraphOptions:
+    """Loss and priors of a configuration, for the lenses that the problem has."""
     loss: LossName = "cauchy" if config.loss == "adaptive" else config.loss
-    options = GraphOptions(
+    return GraphOptions(
         loss=loss,
         loss_scale=SCALE_95[loss],
         lens_priors=lens_priors(problem.initial, config),
         rig_priors=rig_priors(problem.initial, config, problem.reference),
         shared_lenses=shared_lenses(problem, config),
     )
-    try:
+
+
+def choose_lens(problem: Problem, config: RigConfig, progress: Progress) -> Ladder | None:
+    """The lenses that were tried on cameras without a given one; None: all have one."""
+    autos = on_ladder(config, [camera.name for camera in problem.initial.cameras])
+    if not autos:
+        return None
+    with _refusals(problem):
+        return climb(
+            problem,
+            lambda changed: options_of(changed, config),
+            autos,
+            config.min_parallax_deg,
+            on_rung=lambda done, total: progress("choosing the lens", done, total),
+        )
+
+
+def solve_problem(
+    problem: Problem, config: RigConfig, progress: Progress, ladder: Ladder | None = None
+) -> Refinement:
+    """The graph's optimum under the configuration's priors, with the lens that a ladder chose."""
+    options = options_of(problem, config)
+    if ladder is not None:
+        problem, options = on_rung_of(
+            problem,
+            ladder.best.rung,
+            lambda changed: options_of(changed, config),
+            on_ladder(config, [camera.name for camera in problem.initial.cameras]),
+        )
+    with _refusals(problem):
         return refine(
             problem,
             options,
             config.min_parallax_deg,
             config.max_observations,
             on_iteration=lambda iteration, cost: progress("solving", iteration, 0),
-            adaptive=adaptive,
+            adaptive=config.loss == "adaptive",
         )
+
+
+@contextmanager
+def _refusals(problem: Problem) -> Iterator[None]:
+    """What the maths refuses, in one line; a scan without motion is called by its name."""
+    try:
+        yield
+    except ValueError as error:
+        why = too_little_motion(problem, parallax_found=not isinstance(error, NoParallaxError))
+        raise CalibrationError(why or str(error)) from error
+
+
+def covariance_of(
+    refinement: Refinement, config: RigConfig, progress: Progress
+) -> tuple[CalibrationCovariance, SplitCheck | None]:
+    """The joint covariance at the optimum, with the jackknife, and what halves of the scan say."""
+    graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
+    parallax = config.min_parallax_deg
+    progress("covariance", 0, 0)
+    try:
+        covariance = calibration_covariance(
+            graph, estimate, values, parallax,
+            on_block=lambda done, total: progress("leaving out frames", done, total),
+        )  # fmt: skip
+        return covariance, split_check(graph, estimate, covariance, parallax)
     except ValueError as error:
         raise CalibrationError(str(error)) from error
 
 
-def covariance_of(refinement: Refinement) -> CalibrationCovariance:
-    """The joint covariance at the optimum, as `calibration_covariance`."""
+def certificate_of(
+    refinement: Refinement, config: RigConfig, progress: Progress
+) -> Certificate | None:
+    """How the stated sigmas do on simulated twins of the scan, where that is asked for."""
+    if config.certify == 0:
+        return None
     try:
-        return calibration_covariance(refinement.graph, refinement.estimate, refinement.values)
+        return certify(
+            refinement, config.certify, config.seed, config.min_parallax_deg,
+            on_trial=lambda done, total: progress("certifying", done, total),
+        )  # fmt: skip
     except ValueError as error:
         raise CalibrationError(str(error)) from error

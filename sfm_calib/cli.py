@@ -1,4 +1,4 @@
-"""The command line: `sfm-calib calibrate`, `simulate`, `simulate-tracks`, `demo`."""
+"""The command line: `sfm-calib calibrate`, `check`, `simulate`, `simulate-tracks`, `demo`."""
 
 from __future__ import annotations
 
@@ -21,10 +21,13 @@ from pydantic import ValidationError
 import sfm_calib
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, calibrate
+from sfm_calib.check import check_scan
+from sfm_calib.check_terminal import print_check
 from sfm_calib.colmap import quiet
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, Options, RigConfig, first_problem, load_rig_config
 from sfm_calib.errors import CalibrationError
+from sfm_calib.files import write_atomically
 from sfm_calib.images import camera_names, check_exists
 from sfm_calib.report import TruthRow, write_report
 from sfm_calib.result import load_calibration, save_calibration
@@ -65,6 +68,27 @@ class Calibrate:
 
 
 @dataclass(frozen=True)
+class Check:
+    """Say whether a scan can calibrate its rig, and what to add, before the full solve.
+
+    Takes as long as features, matches and mapping do. With -o, OUT/cache keeps these for
+    `calibrate -o OUT`, and OUT/check.json the numbers. The exit code is 0 whatever is found.
+    """
+
+    scan: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
+    """Folder with a sub-folder of images per camera, or of one camera's images, or a video."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="OUT")] = None
+    """Folder for cache and check.json; default: nothing is kept."""
+    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
+    fresh: bool = False
+    """Ignore what earlier runs left in OUT/cache."""
+    json: bool = False
+    """Print check.json on stdout instead of the table."""
+    verbose: Verbose = False
+    """Show COLMAP's own log."""
+
+
+@dataclass(frozen=True)
 class Simulate:
     """Render a scan of a textured room with known truth: OUT/scan and OUT/truth.json."""
 
@@ -100,15 +124,17 @@ class Demo:
     """Show COLMAP's own log."""
 
 
-Command = Calibrate | Simulate | SimulateTracks | Demo
+Command = Calibrate | Check | Simulate | SimulateTracks | Demo
 
 
 def parse(argv: Sequence[str], options: Options | None = None) -> Command:
     """The command line as a command; `options` are the defaults that a rig.yaml gives."""
     default = Calibrate(tyro.MISSING, tyro.MISSING, options or Options())
     calibrate_type = Annotated[Calibrate, tyro.conf.subcommand("calibrate", default=default)]
+    check_default = Check(tyro.MISSING, None, options or Options())
     commands: Any = (
         calibrate_type
+        | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -165,6 +191,8 @@ def run(command: Command, arguments: Sequence[str]) -> None:
     """Do what a parsed command asks for."""
     if isinstance(command, Calibrate):
         run_calibrate(command, arguments)
+    elif isinstance(command, Check):
+        run_check(command, arguments)
     elif isinstance(command, Simulate):
         with progress_bars() as progress:
             simulate_scan(command.options, command.out, progress, command.overwrite)
@@ -178,12 +206,8 @@ def run(command: Command, arguments: Sequence[str]) -> None:
 
 
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
-    """Calibrate a scan; flags go before rig.yaml, and rig.yaml before the defaults."""
-    check_exists(command.scan)
-    from_file = load_rig_config(rig_file(command.scan))
-    again = parse(arguments, from_file.options())
-    assert isinstance(again, Calibrate)
-    config = from_file.with_options(again.options)
+    """Calibrate a scan, and compare with the truth where it is given."""
+    config = config_of(command.scan, arguments)
     truth = load_calibration(command.truth) if command.truth else None
     if truth:
         check_same_cameras(camera_names(command.scan), truth)  # now rather than after the work
@@ -193,6 +217,46 @@ def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
         )
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
         finish(outcome, command.out, rows, command.json)
+
+
+def run_check(command: Check, arguments: Sequence[str]) -> None:
+    """Check a scan, in a cache that is kept where -o says so."""
+    config = config_of(command.scan, arguments)
+    quiet(command.verbose)
+    with check_folder(command.out) as place:
+        with progress_bars() as progress:
+            cache = Cache(place / "cache", command.fresh)
+            check = check_scan(command.scan, config, cache, progress)
+        text = check.model_dump_json(indent=1)
+        if command.out:
+            write_atomically(place / "check.json", text)
+    if command.json:
+        print(text)
+        return
+    console = result_console()
+    print_check(check, console)
+    if command.out:
+        console.print(f"{command.out / 'check.json'} written", soft_wrap=True)
+
+
+@contextmanager
+def check_folder(out: Path | None) -> Iterator[Path]:
+    """OUT as `output_folder`, or a temporary folder, gone afterwards."""
+    if out:
+        with output_folder(out):
+            yield out
+    else:
+        with tempfile.TemporaryDirectory(prefix="sfm_calib.") as temporary:
+            yield Path(temporary)
+
+
+def config_of(scan: Path, arguments: Sequence[str]) -> RigConfig:
+    """What is asked of a scan: flags go before rig.yaml, and rig.yaml before the defaults."""
+    check_exists(scan)
+    from_file = load_rig_config(rig_file(scan))
+    again = parse(arguments, from_file.options())
+    assert isinstance(again, Calibrate | Check)
+    return from_file.with_options(again.options)
 
 
 def rig_file(scan: Path) -> Path:

@@ -19,7 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from graphs.camera import Camera, nominal_params
-from graphs.frames import Transform
+from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from graphs.problem import Observations
 from graphs.rig_start import FreeModel
@@ -330,10 +330,26 @@ def map_images(
     return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
+def keypoint_scales(database: Path) -> dict[str, FloatArray]:
+    """Sizes (n,) in px of the keypoints of each image, by path: how far their frames reach."""
+    with pycolmap.Database.open(database) as db:
+        frames = {
+            image.name: np.asarray(db.read_keypoints(image.image_id), dtype=np.float64)[:, 2:6]
+            for image in db.read_all_images()
+        }
+    return {name: np.abs(np.linalg.det(a.reshape(-1, 2, 2))) ** 0.5 for name, a in frames.items()}
+
+
 def free_model(
-    reconstruction: pycolmap.Reconstruction, scan: Scan, lenses: Sequence[LensName]
+    reconstruction: pycolmap.Reconstruction,
+    scan: Scan,
+    lenses: Sequence[LensName],
+    scales: dict[str, FloatArray],
 ) -> FreeModel:
-    """A reconstruction as arrays: poses by (camera, frame), points, observations."""
+    """A reconstruction as arrays: poses by (camera, frame), points, observations.
+
+    scales: as `keypoint_scales`.
+    """
     place = {image.path: image for image in scan.images}
     images = {i: reconstruction.images[i] for i in sorted(reconstruction.reg_image_ids())}
     cameras: dict[int, Camera] = {}
@@ -349,7 +365,7 @@ def free_model(
             name, lens = scan.cameras[here.camera], lenses[here.camera]
             cameras[here.camera] = camera_from_colmap(name, lens, found)
     keypoints = {i: np.array([p.xy for p in image.points2D]) for i, image in images.items()}
-    pixels, frames, owners, points, positions = [], [], [], [], []
+    pixels, frames, owners, points, positions, sizes = [], [], [], [], [], []
     for number, point_id in enumerate(sorted(reconstruction.points3D)):
         point = reconstruction.points3D[point_id]
         positions.append(np.ravel(point.xyz))
@@ -360,9 +376,11 @@ def free_model(
             frames.append(here.frame)
             owners.append(here.camera)
             points.append(number)
+            sizes.append(scales[images[image_id].name][keypoint])
     observations = Observations(
-        np.array(pixels), np.array(frames), np.array(owners), np.array(points)
-    )
+        np.array(pixels), np.array(frames), np.array(owners), np.array(points),
+        feature_scale=np.array(sizes),
+    )  # fmt: skip
     every = tuple(
         cameras.get(i) or _unseen_camera(scan, lenses, i) for i in range(len(scan.cameras))
     )

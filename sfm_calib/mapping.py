@@ -77,7 +77,9 @@ def map_scan(
         lambda place: run_apart(_map, (scan, config, nominal, database, place), progress),
     )
     try:
-        models = [colmap.free_model(m, scan, lenses) for m in colmap.read_models(place)]
+        found = colmap.read_models(place)
+        scales = colmap.keypoint_scales(database)
+        models = [colmap.free_model(model, scan, lenses, scales) for model in found]
     except (OSError, ValueError) as error:
         raise CalibrationError(f"{place} is damaged: run again with --fresh") from error
     model, cam_from_rig = _one_model(scan, models, reference, database)

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphs.camera import Camera, nominal_params
 from graphs.frames import Transform
-from graphs.lenses import PARAMETER_NAMES, LensName
+from graphs.lenses import FOCAL_AND_CENTRE, PARAMETER_NAMES, LensName
 from graphs.priors import LensPrior, RigPrior, stated_lens_prior, weak_lens_prior
 from graphs.problem import Estimate, Problem
 from sfm_calib.config import CameraConfig, RigConfig
@@ -23,21 +23,41 @@ def camera_config(config: RigConfig, name: str) -> CameraConfig:
     return config.cameras.get(name, CameraConfig())
 
 
-# Webcam boards show p2 = 0.003; without p1, p2 the corridor rig's focal lengths come out 3.4 %
-# short instead of 2 %, the street rig's 3.6 % instead of 0.3 %. A lone camera cannot tell p1, p2
-# from its principal point: on the fountain they move it by 4 px for nothing.
+# Where mapping starts when nothing is said, before the ladder of `graphs.ladder` chooses. Without
+# p1, p2 the focal lengths of the corridor rig come out 3.4 % short instead of 2 %, the street rig's
+# 3.6 % instead of 0.3 %; on the fountain's lone camera they move the principal point for nothing.
 RIG_LENS: LensName = "radtan"
 LONE_LENS: LensName = "radial"
 
 
 def lens_of(config: RigConfig, name: str, n_cameras: int) -> LensName:
-    """The camera's own lens, or the one of all, or what its rig can determine."""
+    """The camera's own lens, or the one of all, or the one that mapping starts with."""
     said = camera_config(config, name).lens
     if said is not None:
         return said
     if config.lens != "auto":
         return config.lens
     return RIG_LENS if n_cameras > 1 else LONE_LENS
+
+
+def on_ladder(config: RigConfig, names: Sequence[str]) -> tuple[int, ...]:
+    """Indices of the cameras whose lens is to be found.
+
+    One of whose distortion rig.yaml says something, or a camera that shares its lens with it, keeps
+    the lens that has those parameters.
+    """
+    if config.lens != "auto":
+        return ()
+    given = {
+        name
+        for name in names
+        if (said := camera_config(config, name)).lens is not None
+        or not {*said.params, *said.sigma, *said.fixed} <= set(FOCAL_AND_CENTRE)
+    }
+    for group in config.shared_lenses:
+        if given & set(group):
+            given |= set(group)
+    return tuple(index for index, name in enumerate(names) if name not in given)
 
 
 def check_config(config: RigConfig, scan: Scan) -> None:

@@ -16,6 +16,7 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 
 FORMAT: Final = "sfm_calib/1"
+PRIOR_DECIDES_SHARE = 0.5  # of what is known of a parameter: more is belief rather than data
 
 
 class Record(BaseModel):
@@ -86,19 +87,134 @@ class Covariance(Record):
         return self
 
 
+class Sigmas(Record):
+    """One parameter's sigmas, by what they allow for; the units of its `sigma` in the covariance.
+
+    Stated is none of them but what covers: the model's, and all that errs together beyond it.
+    """
+
+    model: float  # independent noise
+    robust: float  # and what frames, tracks and cells of the image err together
+    jackknife: float | None = None  # by leaving out blocks of frames; None: too few frames
+    stated: float
+
+
+class NoiseBySize(Record):
+    """The noise of one camera's keypoints of about one size."""
+
+    smallest_px: float | None  # scale of the keypoints, from; None: their sizes are not known
+    largest_px: float | None  # to
+    n_observations: int
+    sigma_px: float  # robust, of one pixel coordinate
+
+
 class Noise(Record):
     """How well the features were located, and how far the stated sigmas exceed the model's."""
 
     sigma_px: float  # robust sigma of one pixel coordinate
     inflation: float = 1.0  # median of stated sigma / model sigma
+    by_size: dict[str, tuple[NoiseBySize, ...]] = {}  # of each camera
+    sigmas: dict[str, Sigmas] = {}  # of each parameter, by its name in the covariance
+
+
+class ProjectionSigma(Record):
+    """Sigma, in the worst direction, of where the calibration alone places a fixed point.
+
+    relative_to "camera": from the lens; "rig": from all lenses and cam_from_rig. How the camera,
+    or the rig, is turned is not part of it: `graphs.uncertainty.projection_maps`.
+    """
+
+    relative_to: Literal["camera", "rig"]
+    range: float | None  # of the point from the camera, in Uncertainty.unit; None: infinity
+    centre_px: float
+    rms_px: float  # over the image
+    corner_px: float  # the worst of the four
+
+
+class DepthSigma(Record):
+    """Sigma of a depth from one pixel in each of two cameras; None where there is no depth."""
+
+    range: float
+    sigma_noise: float | None = None  # averages out over measurements
+    sigma_calibration: float | None = None  # does not
+    missing: Literal["", "not in both images", "not determined"] = ""
+
+
+class PairDepth(Record):
+    """Two cameras' depths in the middle of what both see, counted from the first."""
+
+    cameras: tuple[str, str]
+    baseline: float
+    common_view: bool
+    determined_to: float | None = None  # 0: nowhere; None: as far as 200 baselines
+    depth: tuple[DepthSigma, ...] = ()
+
+
+class Uncertainty(Record):
+    """What the stated covariance means for pixels and for depths."""
+
+    unit: Literal["m", "baseline"] | None = None  # of ranges and depths; None: there is no unit
+    sigma_px: float | None = None  # noise of one pixel coordinate in depths; None: no depths
+    projection: dict[str, tuple[ProjectionSigma, ...]] = {}
+    depth: tuple[PairDepth, ...] = ()
+
+
+class Split(Record):
+    """Two halves of the frames, each calibrated alone, and how far they project apart.
+
+    rms over all images, once a rotation of the rig has undone what it can.
+    """
+
+    difference_px: float
+    expected_px: float  # by the stated covariances of the halves
+    p_value: float  # of a larger difference, if those are true
+    agrees: bool
+
+
+class Certificate(Record):
+    """How the stated sigmas did on simulated twins of this scan, whose truth is known."""
+
+    trials: int
+    failed: int
+    nees: float  # mean squared error over the stated covariance, a degree of freedom; 1 is right
+    nees_standard_error: float
+    model_nees: float  # the same over the model covariance
+    coverage: float  # of 95 % intervals, over all parameters
+    least_covered: str  # parameter
+    least_coverage: float
+    holds: bool
 
 
 class WeakDirection(Record):
-    """Something that the scan leaves to the priors, and what would determine it."""
+    """A change of lenses and rig that the scan hardly notices, and what would determine it.
+
+    Effects are those of one stated sigma along it.
+    """
 
     what: str
-    effect_px: float | None
+    effect_px: float | None  # on the picture, the larger of centre and corner
     remedy: str
+    kind: str = ""
+    parameters: tuple[str, ...] = ()  # that it moves, the most moved first
+    moves: tuple[float, ...] = ()  # how far, in their own units
+    slide_px: float | None = None  # what the parameters move, each as the px it would move alone
+    data_slide_px: float | None = None  # without priors; None: the data say nothing at all
+    effect_centre_px: float | None = None  # of all together, once the rig turned as suits best
+    effect_corner_px: float | None = None
+    prior_share: float | None = None  # of the information: 0 data alone, 1 belief alone
+
+    @property
+    def sizes(self) -> str:
+        """How far one sigma goes: of the parameters, and of what is left of it in the picture."""
+        if self.slide_px is None or self.effect_centre_px is None or self.effect_corner_px is None:
+            return "" if self.effect_px is None else f"up to {self.effect_px:.2g} px in the image"
+        said = (
+            f"free by {self.slide_px:.2g} px, which shows as {self.effect_centre_px:.2g} px at the "
+            f"centre and {self.effect_corner_px:.2g} px in a corner"
+        )
+        if self.prior_share is not None and self.prior_share > PRIOR_DECIDES_SHARE:
+            said += f"; {self.prior_share:.0%} of what is known comes from priors"
+        return said
 
 
 class Verdict(Record):
@@ -107,6 +223,34 @@ class Verdict(Record):
     usable: bool
     weak: tuple[WeakDirection, ...] = ()
     messages: tuple[str, ...] = ()
+    split: Split | None = None  # None: half of the frames determine too little
+    certificate: Certificate | None = None  # None: not asked for
+
+
+class Rung(Record):
+    """One lens of the ladder, on a share of the tracks, beside the rung that stood before it."""
+
+    lens: LensName
+    held: tuple[str, ...] = ()  # coefficients that it holds at their nominal values
+    held_out_px: float | None  # robust rms error in frames that it was not fitted to
+    against: int  # the rung that it is compared with, counted from 0
+    gain_px: float  # held-out error that it removes; negative: adds
+    gain_sigmas: float  # that in its own standard errors
+    shift_focal_px: float
+    shift_centre_px: float
+    sigma: dict[str, float]  # robust, of every lens parameter, as `camera.fx`
+    weak: tuple[str, ...]  # directions, and coefficients that are left to belief
+    verdict: str
+
+
+class LensChoice(Record):
+    """How `lens: auto` was decided."""
+
+    chosen: int  # rung, counted from 0
+    reason: str
+    n_frames: int  # held out in turn
+    n_observations: int
+    rungs: tuple[Rung, ...]
 
 
 class Selection(Record):
@@ -159,6 +303,8 @@ class Calibration(Record):
     rig: RigResult
     covariance: Covariance = Covariance()
     noise: Noise | None = None
+    uncertainty: Uncertainty | None = None
+    lens_choice: LensChoice | None = None  # None: every camera's lens was given
     verdict: Verdict | None = None
     solve: Solve | None = None
     provenance: Provenance = Field(default_factory=lambda: Provenance(version=""))

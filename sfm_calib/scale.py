@@ -19,6 +19,7 @@ from graphs.problem import (
     Observations,
     Problem,
     ScaleSource,
+    joined,
     residuals_px,
 )
 from graphs.refine import noise_of
@@ -228,13 +229,7 @@ def _with_mark(
             f"{allowed_px:.0f} px pass with click_sigma_px = {click_sigma_px:g}); click one and "
             "the same spot in every image"
         )
-    joined = Observations(
-        *(
-            np.concatenate([getattr(seen, name), getattr(clicks, name)])
-            for name in ("pixels", "frame", "camera", "point")
-        )
-    )
-    return replace(problem, initial=together, observations=joined)
+    return replace(problem, initial=together, observations=joined([seen, clicks]))
 
 
 def _meeting_point(start: Estimate, clicks: Observations) -> tuple[FloatArray, float]:

@@ -3,51 +3,29 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
+from typing import Literal
 
 import numpy as np
 
 import sfm_calib
 from graphs.budget import Budget
 from graphs.build import root_information
-from graphs.covariance import CalibrationCovariance, Covariance
+from graphs.covariance import Covariance
 from graphs.frames import Transform
-from graphs.problem import KnownSpan, residuals_px
+from graphs.ladder import Ladder, RungResult
+from graphs.observability import observe
+from graphs.problem import residuals_px
 from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
-from graphs.unit import baseline_unit, in_unit_baseline
-from sfm_calib import nominal, result
-from sfm_calib.config import RigConfig
-from sfm_calib.images import Scan
-from sfm_calib.mapping import Mapped
+from sfm_calib import result
+from sfm_calib.run import Run
 from sfm_calib.scale import in_words
+from sfm_calib.uncertainty import uncertainty_of
+from sfm_calib.verdict import verdict_of
 
-PRIOR_DECIDES = 0.5  # of the prior's variance left: the data have said less than the belief
-FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
-# A focal length of 2 % makes depth 2 % wrong; the worst real scan measured states 0.5 %.
-USABLE_FOCAL_SIGMA = 0.02
-CONTRADICTION = 4.0  # stated sigmas between a parameter and what rig.yaml says of it
-REMEDIES = {  # by the first letter of the parameter
-    "f": "bring near and far things into view, and move the camera sideways",
-    "c": "turn the camera about its optical axis between views",
-    "k": "let things of the scene pass through the corners of the image",
-    "p": "turn the camera about its optical axis, and fill the corners of the image",
-}
 LIBRARIES = ("gtsam", "pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
-
-
-@dataclass(frozen=True)
-class Run:
-    """Everything a finished calibration knows of itself."""
-
-    scan: Scan
-    config: RigConfig
-    mapped: Mapped
-    refinement: Refinement
-    covariance: CalibrationCovariance
-    seconds: dict[str, float]
-    command: str
 
 
 def summarise(run: Run) -> tuple[result.Calibration, float]:
@@ -55,42 +33,110 @@ def summarise(run: Run) -> tuple[result.Calibration, float]:
 
     Non-metric rigs are put into units of their longest baseline.
     """
-    estimate, problem = run.refinement.estimate, run.refinement.problem
-    covariance, cam_from_rig, unit = run.covariance.stated, estimate.cam_from_rig, 1.0
-    far = None if problem.scale else baseline_unit(estimate, problem.reference, covariance)
-    if far is not None:
-        covariance = in_unit_baseline(covariance, estimate, far)
-        unit = 1.0 / float(np.linalg.norm(cam_from_rig[far].translation))
-        cam_from_rig = tuple(t.scaled(unit) for t in cam_from_rig)
-    cameras = _cameras(run, covariance)
+    estimate = run.refinement.estimate
+    covariance, unit = run.covariance.stated, 1 / run.covariance.basis.unit
+    in_unit = estimate.scaled(unit)
     calibration = result.Calibration(
-        cameras=cameras,
-        rig=_rig(run, cam_from_rig, covariance, far),
+        cameras=_cameras(run, covariance),
+        rig=_rig(run, in_unit.cam_from_rig, covariance),
         covariance=result.Covariance(
             names=covariance.names, matrix=tuple(map(tuple, covariance.matrix.tolist()))
         ),
-        noise=result.Noise(sigma_px=run.refinement.sigma_px, inflation=run.covariance.inflation),
-        verdict=_verdict(run, cameras),
+        noise=_noise(run),
+        uncertainty=uncertainty_of(
+            in_unit, covariance, _typical_sigma_px(run.refinement), _unit_name(run)
+        ),
+        lens_choice=None if run.ladder is None else _lens_choice(run.ladder),
+        verdict=verdict_of(run),
         solve=_solve(run),
         provenance=_provenance(run),
     )
     return calibration, unit
 
 
+def _noise(run: Run) -> result.Noise:
+    covariance, names = run.covariance, run.scan.cameras
+    by_size: dict[str, list[result.NoiseBySize]] = {name: [] for name in names}
+    for one in run.refinement.noise:
+        ends = one.smallest_px, one.largest_px
+        known = np.isfinite(ends).all()
+        by_size[names[one.camera]].append(
+            result.NoiseBySize(
+                smallest_px=ends[0] if known else None,
+                largest_px=ends[1] if known else None,
+                n_observations=one.count,
+                sigma_px=one.sigma_px,
+            )
+        )
+    jackknife = covariance.jackknife
+    moved = None if jackknife is None else Covariance(jackknife.names, jackknife.covariance).sigma
+    sigmas = {
+        name: result.Sigmas(
+            model=covariance.model.sigma[name],
+            robust=covariance.robust.sigma[name],
+            jackknife=None if moved is None else moved[name],
+            stated=stated,
+        )
+        for name, stated in covariance.stated.sigma.items()
+    }
+    return result.Noise(
+        sigma_px=run.refinement.sigma_px,
+        inflation=covariance.inflation,
+        by_size={name: tuple(classes) for name, classes in by_size.items()},
+        sigmas=sigmas,
+    )
+
+
+def _lens_choice(ladder: Ladder) -> result.LensChoice:
+    return result.LensChoice(
+        chosen=ladder.chosen,
+        reason=ladder.reason,
+        n_frames=ladder.n_frames,
+        n_observations=ladder.n_observations,
+        rungs=tuple(_rung(tried) for tried in ladder.rungs),
+    )
+
+
+def _rung(tried: RungResult) -> result.Rung:
+    covariance = tried.covariance
+    observed = observe(
+        tried.graph, tried.estimate, covariance.stated, covariance.model, covariance.basis.unit
+    )
+    lenses = {f"{camera.name}.{p}" for camera in tried.estimate.cameras for p in camera.names}
+    return result.Rung(
+        lens=tried.rung.lens,
+        held=tried.rung.held,
+        held_out_px=tried.held_out_px if np.isfinite(tried.held_out_px) else None,
+        against=tried.against,
+        gain_px=tried.gain_px,
+        gain_sigmas=tried.gain_sigmas,
+        shift_focal_px=tried.shift_focal_px,
+        shift_centre_px=tried.shift_centre_px,
+        sigma={name: s for name, s in covariance.stated.sigma.items() if name in lenses},
+        weak=(*(one.what for one in observed.weak), *tried.weak),
+        verdict=tried.verdict,
+    )
+
+
+def _typical_sigma_px(refinement: Refinement) -> float:
+    relative = refinement.problem.observations.relative_sigma
+    return refinement.sigma_px * (1.0 if relative is None else float(np.median(relative)))
+
+
 def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]:
     graph, seen = run.refinement.graph, run.refinement.problem.observations
-    sigma = covariance.sigma
+    sigma, model = covariance.sigma, run.covariance.model
     entries = {}
     for index, camera in enumerate(run.refinement.estimate.cameras):
         own = {p: sigma.get(f"{camera.name}.{p}", 0.0) for p in camera.names}
         prior = graph.lens_priors[graph.layout.lens_of[index]]
         prior_sigma = np.sqrt(np.diag(np.linalg.inv(prior.information())))
         share = {
-            p: min(own[p] ** 2 / float(s) ** 2, 1.0) if free else 1.0
+            p: min(model.sigma[f"{camera.name}.{p}"] ** 2 / float(s) ** 2, 1.0) if free else 1.0
             for p, s, free in zip(camera.names, prior_sigma, prior.free, strict=True)
         }
         if np.isfinite(prior.aspect_sigma):
-            ratio = covariance.of_difference(f"{camera.name}.fy", f"{camera.name}.fx")
+            ratio = model.of_difference(f"{camera.name}.fy", f"{camera.name}.fx")
             share["fy/fx"] = min((ratio / camera.params[0] / prior.aspect_sigma) ** 2, 1.0)
         rows = seen.camera == index
         entries[camera.name] = result.CameraResult(
@@ -105,11 +151,15 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
     return entries
 
 
-def _rig(
-    run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance, far: int | None
-) -> result.RigResult:
+def _unit_name(run: Run) -> Literal["m", "baseline"] | None:
+    if run.refinement.problem.scale is not None:
+        return "m" if len(run.scan.cameras) > 1 else None
+    return None if run.covariance.basis.unit_camera is None else "baseline"
+
+
+def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) -> result.RigResult:
     problem, names = run.refinement.problem, run.scan.cameras
-    sigma = covariance.sigma
+    sigma, far = covariance.sigma, run.covariance.basis.unit_camera
     transforms = {}
     for name, transform in zip(names, cam_from_rig, strict=True):
         turn = [np.degrees(sigma.get(f"{name}.rotation_{axis}", 0.0)) for axis in "xyz"]
@@ -152,78 +202,6 @@ def _scale_sigma(run: Run) -> float:
         run.refinement.values,
     )
     return sigma_m / scale.length_m
-
-
-def _verdict(run: Run, cameras: dict[str, result.CameraResult]) -> result.Verdict:
-    refinement, problem = run.refinement, run.refinement.problem
-    messages = [*run.scan.warnings, *run.mapped.messages]
-    if len(problem.frame_names) < FEW_FRAMES:
-        messages.append(
-            f"only {len(problem.frame_names)} frames: sigmas rest on how much frames differ, and "
-            f"fewer than {FEW_FRAMES} show that poorly; expect errors above the stated sigmas"
-        )
-    believed = [
-        (name, parameter)
-        for name, entry in cameras.items()
-        for parameter in entry.params
-        if entry.prior_share.get(parameter, 0.0) > PRIOR_DECIDES
-        and parameter not in nominal.camera_config(run.config, name).fixed
-    ]
-    reasons = (
-        []
-        if refinement.summary.converged
-        else [f"the solve did not converge: {refinement.summary.reason}"]
-    )
-    for name, entry in cameras.items():
-        for parameter in ("fx", "fy"):
-            relative = entry.sigma[parameter] / entry.params[parameter]
-            if relative > USABLE_FOCAL_SIGMA:
-                reasons.append(
-                    f"the sigma of {name}.{parameter} is {relative:.0%} of it (usable up to "
-                    f"{USABLE_FOCAL_SIGMA:.0%})"
-                )
-    messages += _contradictions(run) + _lost_clicks(run)
-    messages = [f"not usable: {reason}" for reason in reasons] + messages
-    weak = tuple(_weak_direction(cameras[name], name, parameter) for name, parameter in believed)
-    return result.Verdict(usable=not reasons, weak=weak, messages=tuple(messages))
-
-
-def _contradictions(run: Run) -> list[str]:
-    """Parameters that came out far from what rig.yaml states of them."""
-    found = []
-    for camera, prior in zip(
-        run.refinement.estimate.cameras, run.refinement.graph.lens_priors, strict=True
-    ):
-        stated = nominal.camera_config(run.config, camera.name).sigma
-        for name, value, mean in zip(camera.names, camera.params, prior.mean, strict=True):
-            if name in stated and abs(value - mean) > CONTRADICTION * stated[name]:
-                found.append(
-                    f"{camera.name}.{name} came out {abs(value - mean) / stated[name]:.0f} of its "
-                    f"stated sigmas from {mean:g}: the scan contradicts rig.yaml"
-                )
-    return found
-
-
-def _lost_clicks(run: Run) -> list[str]:
-    """Clicks on marks that were set aside as mismatches."""
-    said, problem = run.config.scale.points, run.refinement.problem
-    if said is None or not isinstance(problem.scale, KnownSpan):
-        return []
-    given = sum(map(len, said.between))
-    left = int(np.isin(problem.observations.point, problem.scale.points).sum())
-    if left == given:
-        return []
-    return [
-        f"{given - left} of {given} clicks on the marks of scale.points contradict the others and "
-        "were set aside: look at them again"
-    ]
-
-
-def _weak_direction(entry: result.CameraResult, name: str, parameter: str) -> result.WeakDirection:
-    in_px = entry.sigma[parameter] if parameter in ("fx", "fy", "cx", "cy") else None
-    return result.WeakDirection(
-        what=f"{name}.{parameter}", effect_px=in_px, remedy=REMEDIES[parameter[0]]
-    )
 
 
 def _solve(run: Run) -> result.Solve:

@@ -24,7 +24,10 @@ from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.images import Progress as Report
 from sfm_calib.report import TruthRow
-from sfm_calib.result import Calibration
+from sfm_calib.report.checks import checks_of
+from sfm_calib.report.lens_ladder import rung_label
+from sfm_calib.report.weak import Mark, marks_of
+from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration
 
 SUSPICIOUS_Z = 4.0
 PIPED_WIDTH = 80
@@ -89,21 +92,68 @@ def result_console() -> Console:
 
 def print_result(calibration: Calibration, console: Console) -> None:
     """The parameters with their sigmas, and what is to be said of them."""
+    marks = marks_of(calibration)
     for name, camera in calibration.cameras.items():
         _print_line(
             console,
             f"{name}: {camera.lens}, {camera.size[0]} x {camera.size[1]} px, "
             f"{camera.n_images} images, {camera.n_observations} observations",
         )
-        table = _table("", "value", "sigma", "from priors")
+        table = _table("", "value", "sigma", "of noise alone", "from priors", "")
         for parameter in PARAMETER_NAMES[camera.lens]:
             value, sigma = camera.params[parameter], camera.sigma.get(parameter, 0.0)
             share = camera.prior_share.get(parameter, 0.0)
-            table.add_row(parameter, with_digits(value, sigma), sigma_text(sigma), f"{share:.0%}")
+            table.add_row(
+                parameter,
+                with_digits(value, sigma),
+                sigma_text(sigma),
+                _model_sigma(calibration, f"{name}.{parameter}", sigma),
+                f"{share:.0%}",
+                "prior"
+                if sigma > 0 and share > PRIOR_DECIDES_SHARE
+                else _word(marks.get(f"{name}.{parameter}", ())),
+            )
         console.print(table)
     if len(calibration.cameras) > 1:
         _print_rig(calibration, console)
-    solve, noise, verdict = calibration.solve, calibration.noise, calibration.verdict
+    _print_lens_choice(calibration, console)
+    _print_basis(calibration, console)
+    _print_verdict(calibration, console)
+
+
+def _print_lens_choice(calibration: Calibration, console: Console) -> None:
+    """The ladder of lenses, a rung a row."""
+    if (choice := calibration.lens_choice) is None:
+        return
+    _print_line(console, f"lens by frames held out ({choice.n_frames}, in turn): {choice.reason}")
+    table = _table("", "error px", "gain px", "centre moves", "weak")
+    for index, rung in enumerate(choice.rungs):
+        first = index == 0
+        table.add_row(
+            ("> " if index == choice.chosen else "  ") + rung_label(rung),
+            "-" if rung.held_out_px is None else f"{rung.held_out_px:.4f}",
+            "" if first or rung.held_out_px is None else f"{rung.gain_px:+.4f}",
+            "" if first else f"{rung.shift_centre_px:.1f} px",
+            str(len(rung.weak)),
+        )
+    console.print(table)
+
+
+def _word(marks: Sequence[Mark]) -> str:
+    """What a row says of a parameter that is weak, or hangs on the choice of the lens."""
+    words = [mark.word for mark in marks]
+    return "weak" if "weak" in words else words[0] if words else ""
+
+
+def _model_sigma(calibration: Calibration, name: str, sigma: float) -> str:
+    """The sigma if all observations were independent, to the digits of the stated one."""
+    sigmas = calibration.noise.sigmas.get(name) if calibration.noise else None
+    return "" if sigmas is None or not sigma > 0 else with_digits(sigmas.model, sigma)
+
+
+def _print_basis(calibration: Calibration, console: Console) -> None:
+    """What the numbers rest on."""
+    solve, noise = calibration.solve, calibration.noise
     if solve and noise:
         _print_line(
             console,
@@ -113,7 +163,7 @@ def print_result(calibration: Calibration, console: Console) -> None:
         _print_line(
             console,
             f"{solve.n_rejected} mismatches set aside; noise {noise.sigma_px:.2f} px, "
-            f"sigmas widened {noise.inflation:.1f} x",
+            f"sigmas {noise.inflation:.1f} x those of noise alone (median)",
         )
     if solve and (chosen := solve.selection):
         _print_line(
@@ -122,11 +172,20 @@ def print_result(calibration: Calibration, console: Console) -> None:
             f"sigmas {chosen.sigma_factor:.2f} x those of all, at worst "
             f"{chosen.worst_sigma_factor:.2f} x",
         )
-    for weak in verdict.weak if verdict else ():
-        _print_line(console, f"weak: {weak.what} is decided by its prior; {weak.remedy}")
-    for message in verdict.messages if verdict else ():
+
+
+def _print_verdict(calibration: Calibration, console: Console) -> None:
+    """Checks of the sigmas, what is weak, and whether to use the result."""
+    if (verdict := calibration.verdict) is None:
+        return
+    for check in checks_of(verdict):
+        _print_line(console, f"{check.title}: {check.text}")
+    for weak in verdict.weak:
+        sizes = f": {weak.sizes}" if weak.sizes else ""
+        _print_line(console, f"weak: {weak.what}{sizes}; {weak.remedy}")
+    for message in verdict.messages:
         _print_line(console, f"note: {message}")
-    if verdict and not verdict.usable:
+    if not verdict.usable:
         _print_line(console, "NOT USABLE: see the notes above")
 
 
@@ -139,21 +198,25 @@ def _table(*columns: str) -> Table:
     table = Table()
     for column in columns:
         table.add_column(column, justify="right" if column else "left", no_wrap=True)
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"  # long names: whole
     return table
 
 
 def _print_rig(calibration: Calibration, console: Console) -> None:
     """cam_from_rig of every camera but the reference, an axis a row."""
     rig = calibration.rig
-    _print_line(console, f"cam_from_rig: reference {rig.reference}, scale {rig.scale.source}")
+    scale = f"scale {rig.scale.source}" if rig.metric else rig.scale.source.removeprefix("none: ")
+    _print_line(console, f"cam_from_rig: reference {rig.reference}, {scale}")
     table = _table(
         "",
         "",
         "rotation deg",
         "sigma",
-        f"translation {'m' if rig.metric else 'baselines'}",
+        "translation m" if rig.metric else "translation",
         "sigma",
+        "",
     )
+    marks = marks_of(calibration)
     for name, entry in rig.cam_from_rig.items():
         if name == rig.reference:
             continue
@@ -167,6 +230,13 @@ def _print_rig(calibration: Calibration, console: Console) -> None:
                 sigma_text(turned),
                 with_digits(entry.translation[axis], moved),
                 sigma_text(moved),
+                _word(
+                    [
+                        mark
+                        for kind in ("rotation", "translation")
+                        for mark in marks.get(f"{name}.{kind}_{letter}", ())
+                    ]
+                ),
                 end_section=axis == 2,
             )
     console.print(table)

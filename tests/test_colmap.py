@@ -33,7 +33,8 @@ def mapped(scan, place):
         tables = ("images", "cameras", "keypoints", "descriptors", "two_view_geometries")
         content = {t: db.execute(f"select * from {t} order by 1").fetchall() for t in tables}
     models = colmap.map_images(scan, database, place / "models", colmap.attempts(0)[0], quiet)
-    return content, colmap.free_model(models[0], scan, ["radtan"] * 2)
+    scales = colmap.keypoint_scales(database)
+    return content, colmap.free_model(models[0], scan, ["radtan"] * 2, scales)
 
 
 def test_tracks_and_models_are_the_same_every_time(tmp_path):

@@ -10,13 +10,13 @@ from synthetic.problems import small_problem
 
 from graphs.budget import within_budget
 from graphs.build import GraphOptions, build
-from graphs.covariance import calibration_covariance
 from graphs.frames import Transform
 from graphs.priors import PINNED_SIGMA, LensPrior
 from graphs.problem import KnownBaseline, Problem
 from graphs.refine import refine
 from graphs.scale import length_of
 from graphs.solve import solve
+from graphs.stated_covariance import calibration_covariance
 
 OPTIONS = GraphOptions(sigma_px=0.5)
 

@@ -27,8 +27,9 @@ from sfm_calib.images import Scan, ScanImage
 from sfm_calib.mapping import Mapped
 from sfm_calib.nominal import check_config, start_from_config
 from sfm_calib.result import Calibration, load_calibration
+from sfm_calib.run import Run
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
-from sfm_calib.summary import Run, summarise
+from sfm_calib.summary import summarise
 
 TRACKS = TrackOptions(
     rig="stereo", frames=12, points=900, max_points_per_image=60, baseline_sigma_m=0.0,
@@ -83,8 +84,8 @@ def calibrated(problem: Problem, scale: dict[str, object]) -> Calibration:
     config = RigConfig.model_validate({"scale": scale, "lens": "radial"})
     refinement = solve_problem(start_from_config(problem, config), config, lambda *progress: None)
     mapped = Mapped(problem, (), {})
-    covariance = covariance_of(refinement)
-    run = Run(scan_of(problem), config, mapped, refinement, covariance, {}, "")
+    covariance, split = covariance_of(refinement, config, lambda *progress: None)
+    run = Run(scan_of(problem), config, mapped, refinement, covariance, {}, "", split=split)
     return summarise(run)[0]
 
 

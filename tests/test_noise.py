@@ -10,8 +10,17 @@ from scipy.integrate import quad
 from synthetic.problems import calibration_of, small_problem
 
 from graphs.build import GraphOptions, build
+from graphs.frames import FloatArray
 from graphs.losses import LOSS_NAMES, LossName
-from graphs.noise import loss_moments, redundancy, robust_sigma_px
+from graphs.noise import (
+    loss_moments,
+    noise_classes,
+    redundancies,
+    redundancy,
+    robust_sigma_px,
+    with_class_sigmas,
+)
+from graphs.priors import stated_lens_prior, weak_lens_prior
 from graphs.problem import KnownBaseline, Observations, Problem
 from graphs.solve import solve
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
@@ -135,3 +144,111 @@ def test_relative_sigmas_are_of_sigma_px(loss: LossName) -> None:
     plain = build(problem, options)
     for a, b in zip(ours.tracks.clusters, plain.tracks.clusters, strict=True):
         np.testing.assert_allclose(a.root_information, b.root_information)
+
+
+# ---- the noise of classes ------------------------------------------------------------------
+
+
+def sized(problem: Problem, seed: int = 4) -> Problem:
+    """Keypoints of three sizes, the coarse ones of the second camera the worst."""
+    rng, seen = np.random.default_rng(seed), problem.observations
+    size = rng.choice([1.2, 2.4, 9.6], len(seen))
+    return replace(problem, observations=replace(seen, feature_scale=size))
+
+
+def noise_of_size(seen: Observations) -> FloatArray:
+    assert seen.feature_scale is not None
+    return 0.2 + 0.1 * np.log2(seen.feature_scale) * (1 + seen.camera)
+
+
+def test_classes_find_the_noise_of_each_camera_and_size() -> None:
+    problem = sized(problem_of(frames=20, points=2000, max_points_per_image=150))
+    seen, rng = problem.observations, np.random.default_rng(5)
+    sigma = noise_of_size(seen) * np.sqrt(redundancies(problem))
+    left = sigma[:, None] * rng.standard_normal((len(seen), 2))
+    left[rng.random(len(seen)) < 0.05] *= 30
+    left[:50] = np.nan
+    classes = noise_classes(problem, left)
+    assert [c.camera for c in classes] == [0, 0, 0, 1, 1, 1]
+    assert sum(c.count for c in classes) == len(seen)
+    for one in classes:
+        assert one.smallest_px == one.largest_px
+        rows = (seen.camera == one.camera) & (seen.feature_scale == one.smallest_px)
+        assert one.count == rows.sum()
+        assert one.sigma_px == pytest.approx(noise_of_size(seen)[rows][0], rel=0.12)
+
+
+def test_weighing_by_class_leaves_no_class_worse_than_another() -> None:
+    problem = sized(problem_of(frames=20, points=2000, max_points_per_image=150))
+    seen, rng = problem.observations, np.random.default_rng(6)
+    sigma = noise_of_size(seen) * np.sqrt(redundancies(problem))
+    left = sigma[:, None] * rng.standard_normal((len(seen), 2))
+    weighed = with_class_sigmas(problem, left)
+    relative = weighed.observations.relative_sigma
+    assert relative is not None
+    expected = noise_of_size(seen) / noise_of_size(seen)[0]
+    np.testing.assert_allclose(relative / relative[0], expected, rtol=0.15)
+    again = with_class_sigmas(weighed, left).observations.relative_sigma
+    np.testing.assert_allclose(again, relative, rtol=0.15)  # a fixed point but for redundancies
+
+
+def test_sigmas_that_were_given_are_kept_within_a_class() -> None:
+    """As boards or matching by least squares state them: only the class's own factor is new."""
+    problem = problem_of(frames=20, points=2000, max_points_per_image=150)
+    rng = np.random.default_rng(7)
+    given = rng.uniform(0.5, 2, len(problem.observations))
+    seen = replace(problem.observations, relative_sigma=given)
+    problem = replace(problem, observations=seen)
+    spread = given * (1 + seen.camera) * np.sqrt(redundancies(problem))
+    left = 0.3 * spread[:, None] * rng.standard_normal((len(seen), 2))
+    relative = with_class_sigmas(problem, left).observations.relative_sigma
+    assert relative is not None
+    ratio = relative / given
+    for camera in (0, 1):
+        assert np.ptp(ratio[seen.camera == camera]) < 1e-12
+    assert ratio[seen.camera == 1][0] / ratio[seen.camera == 0][0] == pytest.approx(2, rel=0.1)
+
+
+def test_clicks_have_no_size_and_small_classes_join_others() -> None:
+    problem = problem_of(frames=20, points=2000, max_points_per_image=150)
+    size = np.full(len(problem.observations), 2.0)
+    size[::50], size[3::40] = 20.0, np.nan
+    seen = replace(problem.observations, feature_scale=size)
+    problem = replace(problem, observations=seen)
+    left = 0.3 * np.random.default_rng(8).standard_normal((len(seen), 2))
+    classes = noise_classes(problem, left)
+    assert [(c.smallest_px, c.largest_px) for c in classes] == [(2.0, 20.0)] * 2
+    assert sum(c.count for c in classes) == np.isfinite(size).sum()
+    relative = with_class_sigmas(problem, left).observations.relative_sigma
+    assert relative is not None and (relative[np.isnan(size)] == 1).all()
+
+
+def test_data_without_noise_is_left_alone() -> None:
+    problem = sized(problem_of())
+    assert with_class_sigmas(problem, np.zeros((len(problem.observations), 2))) is problem
+
+
+def test_redundancies_are_what_each_point_leaves() -> None:
+    problem, _ = small_problem("radial", cameras=1, frames=8, points=60)
+    ours = redundancies(problem)
+    assert ours.mean() == pytest.approx(redundancy(problem))
+    twice = np.ones(len(problem.observations))
+    twice[problem.observations.frame == 0] = 0.25  # sharper: its point leans on it
+    sharp = replace(problem, observations=replace(problem.observations, relative_sigma=twice))
+    leaning = redundancies(sharp)
+    first = problem.observations.frame == 0
+    assert leaning[first].max() < ours[first].min() < leaning[~first].max()
+
+
+def test_what_is_held_or_shared_takes_no_freedom() -> None:
+    problem = problem_of()
+    measured = 2 * len(problem.observations)
+    held = tuple(
+        stated_lens_prior(c, weak_lens_prior(c), c.named(), {}, ("k1", "k2"))
+        for c in problem.initial.cameras
+    )
+    all_free = redundancy(problem)
+    fixed = redundancy(problem, GraphOptions(SIGMA_PX, lens_priors=held))
+    assert fixed - all_free == pytest.approx(4 / measured)
+    one = redundancy(problem, GraphOptions(SIGMA_PX, lens_priors=held, shared_lenses=((0, 1),)))
+    assert one - all_free == pytest.approx(8 / measured)

@@ -167,7 +167,8 @@ def test_a_nominal_rig_is_imposed_on_the_mapping(tmp_path, monkeypatch) -> None:
     (tmp_path / "models").mkdir()
     mapping._map(scan, config, nominal, database, tmp_path / "models", lambda *done: None)
     assert calls == ["free0", "free1", "free2", "rig"]
-    model = colmap.free_model(colmap.read_models(tmp_path / "models")[0], scan, ["radtan"] * 2)
+    found = colmap.read_models(tmp_path / "models")[0]
+    model = colmap.free_model(found, scan, ["radtan"] * 2, colmap.keypoint_scales(database))
     relative = {
         frame: model.cam_from_world[1, frame] @ model.cam_from_world[0, frame].inverse
         for frame in model.images_of(0)

@@ -21,7 +21,7 @@ from synthetic.calibrated import (
 )
 
 from graphs.build import GraphOptions, build
-from graphs.covariance import POSE_NAMES, Covariance, calibration_covariance
+from graphs.covariance import POSE_NAMES, Covariance
 from graphs.frames import FloatArray, Transform, exp_rotation, reported_from_tangent
 from graphs.pose_covariance import (
     Form,
@@ -39,6 +39,7 @@ from graphs.pose_covariance import (
 from graphs.problem import Estimate
 from graphs.propagation import cross_covariance, lens_names, marginal, pose_names
 from graphs.solve import solve
+from graphs.stated_covariance import calibration_covariance
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.4

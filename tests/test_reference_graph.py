@@ -19,16 +19,12 @@ from synthetic.problems import calibration_of
 
 from graphs.build import NO_KNOWLEDGE, CalibrationGraph, GraphOptions, build
 from graphs.clusters import homogeneous
-from graphs.covariance import (
-    CalibrationCovariance,
-    calibration_columns,
-    calibration_covariance,
-    responses,
-)
 from graphs.frames import FloatArray, Transform, angle_between, log_rotation
+from graphs.influence import responses
 from graphs.keys import lens_key, rig_key
 from graphs.lenses import LensName
 from graphs.losses import LOSS_NAMES, SCALE_95, LossName
+from graphs.model_covariance import calibration_columns
 from graphs.priors import LensPrior
 from graphs.problem import Estimate, IntArray, Problem, residuals_px
 from graphs.reference import (
@@ -42,6 +38,8 @@ from graphs.reference import (
     solve_reference,
 )
 from graphs.solve import SolveSummary, evaluate, linearised, solve, threads
+from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
+from graphs.unit import unit_jacobian
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5
@@ -200,6 +198,12 @@ def to_reported(estimate: Estimate) -> FloatArray:
     return block_diag(*lenses, *(numeric_reported(t) for t in estimate.cam_from_rig[1:]))
 
 
+def in_its_unit(case: Solved) -> FloatArray:
+    """Jacobian to units of the longest baseline, where nothing measured gives a scale."""
+    names, far = case.covariance.model.names, case.covariance.basis.unit_camera
+    return np.eye(len(names)) if far is None else unit_jacobian(names, case.estimate, far)
+
+
 def numeric_reported(cam_from_rig: Transform) -> FloatArray:
     """d (turn about the camera's axes, translation of cam_from_rig) / d GTSAM's tangent."""
     rotation = cam_from_rig.rotation
@@ -285,7 +289,7 @@ def test_the_model_covariance_is_the_dense_inverse(lens: LensName, loss: LossNam
     bread = np.linalg.inv(bread * np.outer(scale, scale)) * np.outer(scale, scale)
     whole = bread @ (score_variance * of_data + of_priors) @ bread
     columns = columns_of(every, calibration_keys(case.graph))
-    jacobian = to_reported(case.estimate)
+    jacobian = in_its_unit(case) @ to_reported(case.estimate)
     expected = jacobian @ whole[np.ix_(columns, columns)] @ jacobian.T
     assert worst_difference(case.covariance.model.matrix, expected) < 1e-5
 
@@ -319,6 +323,6 @@ def test_the_model_covariance_is_that_of_gtsam_marginals(lens: LensName, loss: L
     joint = gtsam.Marginals(case.reference.factors, case.native).jointMarginalCovariance(keys)
     native = np.block([[joint.at(a, b) for b in keys] for a in keys])
     curvature, score_variance = hand_made_moments(case)
-    jacobian = to_reported(case.estimate)
+    jacobian = in_its_unit(case) @ to_reported(case.estimate)
     expected = score_variance / curvature**2 * jacobian @ native @ jacobian.T
     assert worst_difference(case.covariance.model.matrix, expected) < 1e-4

@@ -226,7 +226,7 @@ def test_page_names_every_parameter_and_figure(stereo: Case, stereo_page: str) -
     keys = {a["id"] for _, a in page.tags if "id" in a}
     shown = ("single", "shared", "coverage", "size", "radius", "frames")
     panels = {f"camera-{k}-{panel}" for k in (0, 1) for panel in shown}
-    assert panels | {"heat", "rig-3d", "scan-3d", "truth-z"} <= keys
+    assert panels | {"heat", "rig-3d", "scan-3d", "truth-z", "camera-1-sigma-rig"} <= keys
     assert all(words in page.text for words in SAID)
     assert "frame_003" in stereo_page
     assert set(re.findall(r'href="#(\w+)"', stereo_page)) <= keys
@@ -251,7 +251,8 @@ def test_truth_columns_mark_what_is_beyond_four_sigma(stereo_page: str) -> None:
 def test_mono_has_no_rig_section(mono: Case, tmp_path: Path) -> None:
     text = written(mono, tmp_path)
     assert 'id="rig"' not in text and 'id="rig-3d"' not in text and 'id="truth"' not in text
-    assert 'id="scan-3d"' in text
+    assert 'id="scan-3d"' in text and 'id="camera-0-sigma-camera"' in text
+    assert 'id="camera-0-sigma-rig"' not in text and "Of depths" not in text
 
 
 def test_same_input_same_page(mono: Case, tmp_path: Path) -> None:

@@ -8,7 +8,20 @@ import pytest
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.result import Calibration, load_calibration, save_calibration, truth
+from sfm_calib.result import (
+    Calibration,
+    LensChoice,
+    Noise,
+    NoiseBySize,
+    Rung,
+    Sigmas,
+    Split,
+    Verdict,
+    WeakDirection,
+    load_calibration,
+    save_calibration,
+    truth,
+)
 
 
 def rig(names=("left", "right")):
@@ -29,6 +42,38 @@ def test_what_is_saved_is_read_again(tmp_path):
     assert (
         json.loads((tmp_path / "new" / "calibration.json").read_text())["format"] == "sfm_calib/1"
     )
+
+
+def test_what_the_sigmas_rest_on_is_read_again(tmp_path):
+    size = NoiseBySize(smallest_px=None, largest_px=None, n_observations=9, sigma_px=0.3)
+    rung = Rung(
+        lens="brown", held=("p1",), held_out_px=None, against=0, gain_px=0.0, gain_sigmas=0.0,
+        shift_focal_px=0.0, shift_centre_px=0.0, sigma={"left.fx": 1.0}, weak=(), verdict="",
+    )  # fmt: skip
+    sigmas = {"left.fx": Sigmas(model=0.1, robust=0.2, stated=0.3)}
+    split = Split(difference_px=1.0, expected_px=2.0, p_value=0.5, agrees=True)
+    whole = rig().model_copy(
+        update={
+            "noise": Noise(sigma_px=0.3, sigmas=sigmas, by_size={"left": (size,)}),
+            "lens_choice": LensChoice(
+                chosen=0, reason="", n_frames=0, n_observations=0, rungs=(rung,)
+            ),
+            "verdict": Verdict(usable=True, split=split),
+        }
+    )
+    save_calibration(whole, tmp_path / "calibration.json")
+    assert load_calibration(tmp_path / "calibration.json") == whole
+
+
+def test_how_far_a_weak_direction_goes_is_said():
+    weak = WeakDirection(what="cx", effect_px=1.34, remedy="")
+    assert weak.sizes == "up to 1.3 px in the image"
+    assert weak.model_copy(update={"effect_px": None}).sizes == ""
+    sizes = {"slide_px": 4.5, "effect_centre_px": 0.113, "effect_corner_px": 0.87}
+    free = "free by 4.5 px, which shows as 0.11 px at the centre and 0.87 px in a corner"
+    assert weak.model_copy(update=sizes | {"prior_share": 0.4}).sizes == free
+    believed = weak.model_copy(update=sizes | {"prior_share": 0.9})
+    assert believed.sizes == f"{free}; 90% of what is known comes from priors"
 
 
 def set_in(content, path, value):

@@ -11,9 +11,9 @@ from synthetic.problems import small_problem
 
 from graphs.build import CalibrationGraph, GraphOptions, build, root_information
 from graphs.clusters import homogeneous
-from graphs.covariance import calibration_covariance, responses
 from graphs.frames import FloatArray, log_rotation
 from graphs.gauge import add_gauge
+from graphs.influence import responses
 from graphs.keys import frame_key, lens_key, rig_key
 from graphs.lenses import LensName
 from graphs.losses import LOSS_NAMES, SCALE_95, LossName
@@ -42,6 +42,7 @@ from graphs.reference import (
 from graphs.scale import length_of, total_sigma_m
 from graphs.selection import compact
 from graphs.solve import solve, threads
+from graphs.stated_covariance import calibration_covariance
 from graphs.system import assemble
 
 SIGMA_PX = 0.5

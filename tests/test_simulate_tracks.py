@@ -117,6 +117,17 @@ def test_tracks_survive_the_file(rig: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(calibration.camera("cam0").params, true.cameras[0].params)
 
 
+def test_scales_survive_the_file(tmp_path: Path) -> None:
+    problem, true = simulate_tracks(TRACKS.model_copy(update={"noise_by_scale": True}), rng())
+    scale = problem.observations.feature_scale
+    assert scale is not None and scale.shape == (len(problem.observations),)
+    write_tracks(problem, true, tmp_path)
+    np.testing.assert_array_equal(read_tracks(tmp_path)[0].observations.feature_scale, scale)
+    plain, true = simulate_tracks(TRACKS, rng())
+    write_tracks(plain, true, tmp_path)
+    assert read_tracks(tmp_path)[0].observations.feature_scale is None
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

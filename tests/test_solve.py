@@ -18,13 +18,13 @@ from graphs import solve as solve_module
 from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.camera import Camera, project
 from graphs.clusters import homogeneous
-from graphs.covariance import calibration_covariance
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from graphs.losses import SCALE_95, LossName
 from graphs.problem import Estimate, IntArray, Observations, Problem, points_in_cameras
 from graphs.refine import refine
 from graphs.solve import SolveSummary, evaluate, linearised, solve, threads
+from graphs.stated_covariance import calibration_covariance
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5

@@ -9,8 +9,10 @@ from typing import Literal
 import numpy as np
 
 from graphs.problem import Problem
+from sfm_calib.report.digits import short
 from sfm_calib.report.rows import Z_ALARM, TruthRow
-from sfm_calib.result import Calibration
+from sfm_calib.report.weak import OF_LENS
+from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration, Verdict
 
 Tone = Literal["good", "doubtful", "bad", "unknown"]
 
@@ -35,19 +37,49 @@ class Figure:
 
 def banner(calibration: Calibration) -> Banner:
     """What a reader in a hurry must know."""
-    verdict, solve = calibration.verdict, calibration.solve
+    verdict = calibration.verdict
     if verdict is None:
         return Banner("unknown", "Not judged", "This file holds no verdict.")
     if not verdict.usable:
         return Banner("bad", "Not usable", "Do not deploy this calibration; the reasons follow.")
+    reasons = _reasons_for_care(calibration, verdict)
+    if reasons:
+        return Banner("doubtful", "Usable with care", " ".join(reasons))
+    text = "The solve converged, and the scan leaves nothing weakly determined."
+    if believed := _decided_by_priors(calibration):
+        what = "one parameter is" if believed == 1 else f"{believed} parameters are"
+        text += f" By priors mostly, {what} decided: marked below."
+    return Banner("good", "Usable", text)
+
+
+def _reasons_for_care(calibration: Calibration, verdict: Verdict) -> list[str]:
+    solve, reasons = calibration.solve, []
     if solve is not None and not solve.converged:
-        stopped = f"The solver stopped before it converged: {solve.reason}."
-        return Banner("doubtful", "Usable with care", stopped)
-    if verdict.weak:
-        count = len(verdict.weak)
-        what = "one direction" if count == 1 else f"{count} directions"
-        return Banner("doubtful", "Usable with care", f"The scan left {what} weakly determined.")
-    return Banner("good", "Usable", "The solve converged and no parameter rests on its prior.")
+        reasons.append(f"The solver stopped before it converged: {solve.reason}.")
+    if verdict.certificate is not None and not verdict.certificate.holds:
+        reasons.append("On simulated twins of this scan its sigmas do not hold.")
+    if verdict.split is not None and not verdict.split.agrees:
+        reasons.append("Two halves of the scan contradict each other.")
+    weak = [one for one in verdict.weak if one.kind != OF_LENS]
+    if weak:
+        what = "one direction" if len(weak) == 1 else f"{len(weak)} directions"
+        text = f"The scan left {what} weakly determined"
+        effects = [one.effect_px for one in weak if one.effect_px is not None]
+        if effects:
+            text += f": one sigma shows as up to {short(max(effects))} px in the picture"
+        reasons.append(f"{text}.")
+    if len(weak) < len(verdict.weak):
+        reasons.append("It does not settle which lens this is; what hangs on that is told below.")
+    return reasons
+
+
+def _decided_by_priors(calibration: Calibration) -> int:
+    """How many parameters that were estimated are more belief than data."""
+    return sum(
+        share > PRIOR_DECIDES_SHARE and entry.sigma.get(name, 1.0) > 0
+        for entry in calibration.cameras.values()
+        for name, share in entry.prior_share.items()
+    )
 
 
 def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...]:
@@ -78,16 +110,15 @@ def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...
             Figure(f"{solve.rms_px:.3f} px", "RMS residual", "gross mismatches set aside")
         )
     if noise is not None:
-        figures.append(
-            Figure(f"× {noise.inflation:.2f}", "inflation", "stated sigma / model sigma")
-        )
+        remark = "stated sigma / sigma of noise alone, median"
+        figures.append(Figure(f"× {noise.inflation:.2f}", "inflation", remark))
     return (*figures, _scale_figure(calibration))
 
 
 def _scale_figure(calibration: Calibration) -> Figure:
     scale = calibration.rig.scale
     if not calibration.rig.metric:
-        return Figure("not metric", "scale", f"unit: {scale.source}")
+        return Figure("not metric", "scale", scale.source.removeprefix("none: "))
     remark = f"from {scale.source}"
     if scale.sigma_relative:
         remark += f", ± {100 * scale.sigma_relative:.2g} %"

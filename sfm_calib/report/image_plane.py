@@ -72,8 +72,9 @@ def arrows_figure(part: CameraResiduals) -> tuple[go.Figure, float]:
     rows = evenly(len(part.pixels), ARROWS)
     pixels, residuals, norms = part.pixels[rows], part.residuals[rows], part.norms[rows]
     magnification = round_number(SIGMA_ON_PAGE * float(np.hypot(*camera.size)) / part.sigma_px)
-    outlier = norms > part.limit_px
-    shortened = residuals * (part.limit_px / np.maximum(norms, part.limit_px))[:, None]
+    limits = part.limits_px[rows]
+    outlier = norms > limits
+    shortened = residuals * (limits / np.maximum(norms, limits))[:, None]
     figure = go.Figure()
     for chosen, colour, name in ((~outlier, BLUE, "residual"), (outlier, AMBER, "mismatch")):
         lines = arrows(pixels[chosen], magnification * shortened[chosen])
@@ -131,7 +132,8 @@ def noise_of_cell_mean(part: CameraResiduals) -> float | None:
     full = counts[counts >= CELL_LEAST]
     if not full.size:
         return None
-    return float(part.sigma_px * np.sqrt(np.pi / 2) * np.mean(1 / np.sqrt(full)))
+    sigma_px = np.sqrt(np.mean(part.inliers.sigmas_px**2))
+    return float(sigma_px * np.sqrt(np.pi / 2) * np.mean(1 / np.sqrt(full)))
 
 
 def systematic_figure(part: CameraResiduals) -> tuple[go.Figure, float]:

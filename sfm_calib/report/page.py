@@ -13,6 +13,7 @@ from plotly.offline import get_plotlyjs
 
 from graphs.problem import Estimate, Problem
 from sfm_calib.files import write_atomically
+from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
 from sfm_calib.report.headline import banner, key_figures, truth_summary
 from sfm_calib.report.image_plane import (
@@ -22,6 +23,8 @@ from sfm_calib.report.image_plane import (
     noise_of_cell_mean,
     systematic_figure,
 )
+from sfm_calib.report.lens_ladder import lens_ladder
+from sfm_calib.report.noise import noise_panel
 from sfm_calib.report.residuals import (
     CameraResiduals,
     frames_figure,
@@ -33,24 +36,17 @@ from sfm_calib.report.residuals import (
 from sfm_calib.report.rows import (
     TruthRow,
     camera_tables,
-    length_unit,
     rig_tables,
     rows_without_table,
 )
 from sfm_calib.report.scene import rig_figure, scan_figure
-from sfm_calib.report.theme import figure_html
+from sfm_calib.report.sigmas import sigma_section
+from sfm_calib.report.theme import Panel, figure_html
+from sfm_calib.report.uncertainty import uncertainty_section
+from sfm_calib.report.weak import length_unit, weak_cards
 from sfm_calib.result import Calibration, Provenance
 
 TITLE = "Calibration report"
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A figure with its title and what to look for in it."""
-
-    title: str
-    caption: str
-    figure: Markup
 
 
 @dataclass(frozen=True)
@@ -108,14 +104,20 @@ def render(
         title=title,
         calibration=calibration,
         banner=banner(calibration),
+        checks=checks_of(calibration.verdict),
+        weak_cards=weak_cards(calibration),
         key_figures=key_figures(calibration, problem),
         lens_tables=lenses,
+        ladder=lens_ladder(calibration),
         rig_tables=rig,
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
         truth_summary=truth_summary(truth_rows),
         z_figure=figure_html(z_figure(truth_rows), "truth-z") if truth_rows else "",
         correlation=figure_html(correlation_figure(calibration), "heat") if has_covariance else "",
+        sigmas=sigma_section(calibration),
+        noise=noise_panel(calibration),
+        uncertainty=uncertainty_section(calibration, problem, estimate) if has_covariance else None,
         pairs=strongest_pairs(calibration.covariance) if has_covariance else (),
         cameras=[camera_section(part, problem.frame_names) for part in parts],
         rig_figure=figure_html(rig_figure(estimate, problem.reference, unit), "rig-3d")

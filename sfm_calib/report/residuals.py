@@ -15,6 +15,7 @@ from sfm_calib.report.theme import AMBER, BLUE, INK, MUTED, plain, styled
 
 # Normal noise leaves exp(-8), 0.03 %, of the residuals beyond 4 sigma; the rest are mismatches.
 OUTLIER_SIGMAS = 4.0
+SMALLEST_SIGMA_PX = 1e-9  # perfect data still needs a scale to be drawn at
 RAYLEIGH_MEDIAN = 1.17741  # median norm of two normal coordinates of sigma 1: sqrt(2 ln 2)
 HISTOGRAM_SIGMAS, HISTOGRAM_BINS = 6.0, 48
 RADIUS_BINS, RADIUS_BIN_LEAST = 14, 20  # fewer observations than this say little about a mean
@@ -29,7 +30,7 @@ class CameraResiduals:
     pixels: FloatArray  # (n, 2) observed
     residuals: FloatArray  # (n, 2) projected minus observed
     frames: IntArray  # (n,) index into Problem.frame_names
-    sigma_px: float
+    sigmas_px: FloatArray  # (n,) of one coordinate: large keypoints are located worse
     n_unprojectable: int
 
     @property
@@ -38,21 +39,26 @@ class CameraResiduals:
         return np.linalg.norm(self.residuals, axis=1)
 
     @property
-    def limit_px(self) -> float:
-        """Residuals beyond are mismatches: shown apart, and left out of every mean."""
-        return OUTLIER_SIGMAS * self.sigma_px
+    def sigma_px(self) -> float:
+        """The typical one."""
+        return float(np.median(self.sigmas_px)) if len(self.sigmas_px) else SMALLEST_SIGMA_PX
+
+    @property
+    def limits_px(self) -> FloatArray:
+        """Residuals beyond (n,) are mismatches: shown apart, and left out of every mean."""
+        return OUTLIER_SIGMAS * self.sigmas_px
 
     @property
     def inliers(self) -> CameraResiduals:
         """The same without mismatches."""
-        keep = self.norms <= self.limit_px
+        keep = self.norms <= self.limits_px
         return CameraResiduals(
             self.camera,
             self.index,
             self.pixels[keep],
             self.residuals[keep],
             self.frames[keep],
-            self.sigma_px,
+            self.sigmas_px[keep],
             self.n_unprojectable,
         )
 
@@ -60,14 +66,19 @@ class CameraResiduals:
 def residuals_by_camera(
     problem: Problem, estimate: Estimate, sigma_px: float | None
 ) -> tuple[CameraResiduals, ...]:
-    """The residuals of every camera; `sigma_px` of None takes a robust sigma from them."""
+    """The residuals of every camera.
+
+    sigma_px: of one coordinate where the relative sigma is 1; None takes a robust one from them.
+    """
     observations = problem.observations
     residuals = residuals_px(estimate, observations)
+    relative = observations.relative_sigma
+    relative = np.ones(len(observations)) if relative is None else relative
     finite = np.isfinite(residuals).all(axis=1) & np.isfinite(observations.pixels).all(axis=1)
     if sigma_px is None or not sigma_px > 0:
-        norms = np.linalg.norm(residuals[finite], axis=1)
+        norms = np.linalg.norm(residuals[finite], axis=1) / relative[finite]
         sigma_px = float(np.median(norms)) / RAYLEIGH_MEDIAN if len(norms) else 1.0
-    sigma_px = max(sigma_px, 1e-9)  # perfect data still needs a scale to be drawn at
+    sigma_px = max(sigma_px, SMALLEST_SIGMA_PX)
     parts = []
     for index, camera in enumerate(estimate.cameras):
         mine = observations.camera == index
@@ -80,7 +91,7 @@ def residuals_by_camera(
                 observations.pixels[rows],
                 residuals[rows],
                 observations.frame[rows],
-                sigma_px,
+                sigma_px * relative[rows],
                 lost,
             )
         )
@@ -92,11 +103,11 @@ def summary(part: CameraResiduals) -> str:
     n = len(part.norms)
     if n == 0:
         return "No observation of this camera could be projected."
-    outliers = int((part.norms > part.limit_px).sum())
+    outliers = int((part.norms > part.limits_px).sum())
     text = (
         f"{n:,} observations, median residual {np.median(part.norms):.3f} px; "
-        f"{outliers:,} ({100 * outliers / n:.1f} %) lie beyond {OUTLIER_SIGMAS:.0f} sigma "
-        f"({part.limit_px:.2f} px) and count as mismatches below."
+        f"{outliers:,} ({100 * outliers / n:.1f} %) lie beyond {OUTLIER_SIGMAS:.0f} of "
+        f"their sigmas (typically {part.sigma_px:.2f} px) and count as mismatches below."
     )
     if part.n_unprojectable:
         text += f" {part.n_unprojectable:,} more point(s) cannot be projected and are not shown."
@@ -104,12 +115,12 @@ def summary(part: CameraResiduals) -> str:
 
 
 def histogram_figure(part: CameraResiduals) -> go.Figure:
-    """Residual norms beside the Rayleigh density that sigma_px predicts."""
-    norms, sigma = part.norms, part.sigma_px
-    edges = np.linspace(0, HISTOGRAM_SIGMAS * sigma, HISTOGRAM_BINS + 1)
+    """Residual norms over their sigmas beside the Rayleigh density that noise predicts."""
+    norms = part.norms / part.sigmas_px
+    edges = np.linspace(0, HISTOGRAM_SIGMAS, HISTOGRAM_BINS + 1)
     centres, width = (edges[:-1] + edges[1:]) / 2, edges[1]
     density = np.histogram(norms, edges)[0] / len(norms) / width
-    rayleigh = centres / sigma**2 * np.exp(-((centres / sigma) ** 2) / 2)
+    rayleigh = centres * np.exp(-(centres**2) / 2)
     beyond = 100 * np.mean(norms > edges[-1])
     figure = go.Figure(
         [
@@ -119,20 +130,20 @@ def histogram_figure(part: CameraResiduals) -> go.Figure:
                 width=width,
                 name="measured",
                 marker={"color": BLUE, "opacity": 0.55, "line_width": 0},
-                hovertemplate="%{x:.3f} px<br>density %{y:.3f}<extra></extra>",
+                hovertemplate="%{x:.2f} sigmas<br>density %{y:.3f}<extra></extra>",
             ),
             go.Scatter(
                 x=centres.astype(np.float32),
                 y=rayleigh.astype(np.float32),
-                name=f"Rayleigh, sigma {sigma:.3g} px",
+                name="normal noise (Rayleigh)",
                 line={"color": INK, "width": 2},
                 hoverinfo="skip",
             ),
         ]
     )
     styled(figure, height=330)
-    figure.update_xaxes(title=f"residual norm, px ({beyond:.1f} % lie beyond this axis)")
-    figure.update_yaxes(title="density, 1/px", rangemode="tozero")
+    figure.update_xaxes(title=f"residual norm over its sigma ({beyond:.1f} % lie beyond this axis)")
+    figure.update_yaxes(title="density", rangemode="tozero")
     return figure
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
-from sfm_calib.result import Calibration, CameraResult
+from sfm_calib.report.digits import decimals_for, number
+from sfm_calib.report.weak import Mark, length_unit, marks_of
+from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration, CameraResult
 
 AXES = "xyz"
-# var_posterior / var_prior: at one half the data knows exactly as much as the prior did.
-PRIOR_DECIDES_SHARE = 0.5
 # A normal error beyond 4 sigma comes once in 16,000: the sigma, not chance, is then to blame.
 Z_ALARM = 4.0
-MAX_DECIMALS = 9
+HELD = "held fixed"
+ROUNDING = 1e-12  # of the variances that cancel in a baseline that is the unit
 UNIT_OF_PARAMETER = {"fx": "px", "fy": "px", "cx": "px", "cy": "px"}
 
 
@@ -63,6 +64,12 @@ class QuantityRow:
     unit: str
     prior_share: float | None
     truth: TruthCells | None
+    marks: tuple[Mark, ...] = ()
+
+    @property
+    def held(self) -> bool:
+        """Whether it was not estimated: what its prior did is then no question."""
+        return self.sigma == HELD
 
     @property
     def prior_percent(self) -> float | None:
@@ -72,7 +79,7 @@ class QuantityRow:
     @property
     def prior_decides(self) -> bool:
         """Whether the value is more belief than data."""
-        return self.prior_share is not None and self.prior_share > PRIOR_DECIDES_SHARE
+        return not self.held and (self.prior_share or 0.0) > PRIOR_DECIDES_SHARE
 
 
 @dataclass(frozen=True)
@@ -85,20 +92,6 @@ class CameraTable:
 
 
 Truths = Mapping[str, TruthRow]
-
-
-def decimals_for(sigma: float) -> int | None:
-    """Decimals that show two digits of sigma; None when there is no sigma to go by."""
-    if not math.isfinite(sigma) or sigma <= 0:
-        return None
-    return min(max(1 - math.floor(math.log10(sigma)), 0), MAX_DECIMALS)
-
-
-def number(value: float, decimals: int | None) -> str:
-    """A number with fixed decimals, or with six digits where no sigma says how many count."""
-    if not math.isfinite(value):
-        return "–"
-    return f"{value:.6g}" if decimals is None else f"{value:.{decimals}f}"
 
 
 def quantity(
@@ -115,7 +108,7 @@ def quantity(
     if sigma is None:
         spread = "not estimated"
     elif sigma == 0:
-        spread = "held fixed"
+        spread = HELD
     else:
         spread = number(sigma, decimals) if decimals is not None else "unknown"
     truth = truths.get(name)
@@ -134,17 +127,26 @@ def camera_tables(
     calibration: Calibration, truth_rows: Sequence[TruthRow] = ()
 ) -> tuple[CameraTable, ...]:
     """The lens parameters of every camera."""
-    truths = {row.name: row for row in truth_rows}
+    truths, marks = {row.name: row for row in truth_rows}, marks_of(calibration)
     return tuple(
-        CameraTable(name, _camera_caption(entry), _lens_rows(name, entry, truths))
+        CameraTable(name, _camera_caption(entry), marked(_lens_rows(name, entry, truths), marks))
         for name, entry in calibration.cameras.items()
     )
+
+
+def marked(
+    rows: Sequence[QuantityRow], marks: Mapping[str, tuple[Mark, ...]]
+) -> tuple[QuantityRow, ...]:
+    """The rows with their marks."""
+    return tuple(replace(row, marks=marks.get(row.name, ())) for row in rows)
 
 
 def _camera_caption(entry: CameraResult) -> str:
     caption = f"{entry.lens}, {entry.size[0]} × {entry.size[1]} px"
     if entry.n_images:
         caption += f", {entry.n_images:,} images, {entry.n_observations:,} observations"
+    if entry.prior_share.get("fy/fx", 0.0) > PRIOR_DECIDES_SHARE:
+        caption += "; fy/fx is decided mostly by the prior"
     return caption
 
 
@@ -169,17 +171,16 @@ def rig_tables(
     calibration: Calibration, truth_rows: Sequence[TruthRow] = ()
 ) -> tuple[CameraTable, ...]:
     """Rotation, translation and distance of every camera but the reference."""
-    truths = {row.name: row for row in truth_rows}
+    truths, marks = {row.name: row for row in truth_rows}, marks_of(calibration)
     return tuple(
-        CameraTable(name, _rig_caption(calibration, name), _rig_rows(calibration, name, truths))
+        CameraTable(
+            name,
+            _rig_caption(calibration, name),
+            marked(_rig_rows(calibration, name, truths), marks),
+        )
         for name in calibration.rig.cam_from_rig
         if name != calibration.rig.reference
     )
-
-
-def length_unit(calibration: Calibration) -> str:
-    """What a length of the rig is counted in."""
-    return "m" if calibration.rig.metric else "units"
 
 
 def _rig_caption(calibration: Calibration, name: str) -> str:
@@ -215,7 +216,7 @@ def baseline_sigma(calibration: Calibration, name: str) -> float:
     """Sigma of the distance between a camera and the rig's origin, in the rig's unit.
 
     First order: u' C u with u the direction of the translation; without a covariance in the
-    file, C is the diagonal of the stated sigmas.
+    file, C is the diagonal of the stated sigmas. Zero where the baseline is itself the unit.
     """
     entry, names = calibration.rig.cam_from_rig[name], calibration.covariance.names
     translation = np.array(entry.translation)
@@ -226,7 +227,8 @@ def baseline_sigma(calibration: Calibration, name: str) -> float:
         cov = np.array(calibration.covariance.matrix)[np.ix_(index, index)]
     else:
         cov = np.diag(np.square(entry.sigma_translation))
-    return float(np.sqrt(max(direction @ cov @ direction, 0.0)))
+    variance = float(direction @ cov @ direction)
+    return variance**0.5 if variance > ROUNDING * float(np.trace(cov)) else 0.0
 
 
 def rows_without_table(

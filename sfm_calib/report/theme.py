@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
@@ -36,6 +37,15 @@ CONFIG = {
     # plotly.js 4 offers a button that uploads the figure to plotly's cloud.
     "showSendToCloud": False,
 }
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A figure with its title and what to look for in it."""
+
+    title: str
+    caption: str
+    figure: Markup
 
 
 def plain(text: str) -> str:

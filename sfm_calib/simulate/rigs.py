@@ -16,10 +16,12 @@ from graphs.camera import Camera, fit_lens
 from graphs.frames import FloatArray, Transform, exp_rotation
 from graphs.lenses import PARAMETER_NAMES, LensName
 
-RigName = Literal["mono", "stereo", "triple"]
-TrajectoryName = Literal["handheld", "orbit", "corridor", "panorama", "static"]
+RigName = Literal["mono", "stereo", "triple", "quad"]
+TrajectoryName = Literal[
+    "handheld", "orbit", "corridor", "sideways", "panorama", "forward", "facing", "nadir", "static"
+]
 
-CAMERA_COUNT: dict[RigName, int] = {"mono": 1, "stereo": 2, "triple": 3}
+CAMERA_COUNT: dict[RigName, int] = {"mono": 1, "stereo": 2, "triple": 3, "quad": 4}
 PRESET_WIDTH, PRESET_HEIGHT = 640, 480  # the size for which the lenses below are written
 FISHEYE_FOCAL = 0.55  # of the other lenses' focal length: half a field of view of some 60 deg
 SEMI_AXES_M = (1.4, 1.08)  # of the walk round the pedestal, 0.5 m clear of everything
@@ -41,6 +43,7 @@ LENSES = (
     LensPreset(532.4, 1.0019, (7.3, -5.1), (-0.162, 0.041), (6e-4, -4e-4), (-0.02, 4e-3, 0.0, 0.0)),
     LensPreset(545.8, 0.9982, (-5.6, 4.4), (-0.138, 0.034), (-5e-4, 7e-4), (-0.015, 2e-3, 0, 0)),
     LensPreset(523.1, 1.0023, (4.2, 6.8), (-0.187, 0.049), (4e-4, 5e-4), (-0.024, 5e-3, 0.0, 0.0)),
+    LensPreset(538.6, 0.9985, (-6.1, -3.7), (-0.151, 0.038), (-6e-4, 3e-4), (-0.018, 3e-3, 0, 0)),
 )
 LIKE: dict[LensName, LensName] = {
     "division": "radial",
@@ -53,6 +56,13 @@ MOUNTS: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     ((0.19, 0.015, -0.02), (27.0, 3.0, -2.0)),
     ((-0.165, -0.03, -0.025), (-31.0, -4.0, 3.5)),
+)
+# One camera to each side: no two see the same thing at once, but with the wide kannala_brandt.
+QUAD_MOUNTS = (
+    MOUNTS[0],
+    ((0.10, 0.012, -0.085), (88.5, 2.0, -1.5)),
+    ((0.006, -0.02, -0.17), (178.0, -1.5, 2.0)),
+    ((-0.105, 0.015, -0.08), (-91.0, 1.0, 2.5)),
 )
 STEREO_MOUNT = ((0.20, 0.008, 0.005), (-2.5, 1.0, 0.8))  # the second camera toes in
 
@@ -72,7 +82,8 @@ def make_rig(
 ) -> SimulatedRig:
     """A preset rig; focal length and principal point scale with the image's width."""
     count = CAMERA_COUNT[name]
-    mounts = (MOUNTS[0], STEREO_MOUNT) if name == "stereo" else MOUNTS[:count]
+    special = {"stereo": (MOUNTS[0], STEREO_MOUNT), "quad": QUAD_MOUNTS}
+    mounts = special.get(name, MOUNTS[:count])
     cameras = tuple(make_camera(f"cam{i}", LENSES[i], lens, size) for i in range(count))
     return SimulatedRig(cameras, tuple(_cam_from_rig(*mount) for mount in mounts))
 
@@ -177,6 +188,15 @@ def _corridor(frame: FloatArray, rng: np.random.Generator) -> Walk:
     return position, yaw, pitch, np.deg2rad(1.5) * _sway(frame, 19, rng)
 
 
+def _sideways(frame: FloatArray, rng: np.random.Generator) -> Walk:
+    """To and fro before the wall at +y, 1.3 to 1.7 m away, looking about and tilting by hand."""
+    along = 1.3 * np.sin(rng.uniform(0, 2 * np.pi) + 2 * np.pi * frame / 44)
+    away, height = 1.0 + 0.2 * _sway(frame, 23, rng), 1.4 + 0.3 * _sway(frame, 17, rng)
+    yaw = np.deg2rad(90) + np.deg2rad(24) * _sway(frame, 21, rng)
+    pitch = np.deg2rad(18) * _sway(frame, 19, rng)
+    return np.stack([along, away, height], -1), yaw, pitch, np.deg2rad(40) * _sway(frame, 27, rng)
+
+
 def _panorama(frame: FloatArray, rng: np.random.Generator) -> Walk:
     """Pure rotation of the rig's reference camera, round and round, up and down."""
     position = np.broadcast_to([1.1, 0.6, 1.4], (len(frame), 3))
@@ -192,10 +212,48 @@ def _static(frame: FloatArray, rng: np.random.Generator) -> Walk:
     return position, rng.uniform(0.2, 0.7) * still, -0.1 * still, 0.05 * still
 
 
+def _forward(frame: FloatArray, rng: np.random.Generator) -> Walk:
+    """Straight along the reference camera's optical axis, without any rotation."""
+    along = -1.6 + frame * min(0.08, 3.0 / max(len(frame) - 1, 1))
+    aside, height = np.array([-1.05, 1.3]) + rng.uniform(-0.05, 0.05, 2)
+    still = np.zeros_like(frame)
+    return np.stack([along, aside + still, height + still], -1), still, still, still
+
+
+def _facing(frame: FloatArray, rng: np.random.Generator) -> Walk:
+    """To and fro, up and down, 1.5 m before the wall at +y, looking at it squarely all the time."""
+    along = 1.3 * np.sin(rng.uniform(0, 2 * np.pi) + 2 * np.pi * frame / 44)
+    still = np.zeros_like(frame)
+    position = np.stack([along, 1.0 + still, 1.4 + 0.3 * _sway(frame, 17, rng)], -1)
+    return position, np.pi / 2 + still, still, still
+
+
+NADIR_STEP_M, NADIR_LINE, NADIR_LINES = 0.3, 8, 6  # images a line
+
+
+def _nadir(frame: FloatArray, rng: np.random.Generator) -> Walk:
+    """Line after line at one height, as a drone maps a field: straight down, one heading."""
+    n_stops = NADIR_LINE * NADIR_LINES
+    there_and_back = frame.astype(np.int64) % (2 * n_stops - 2)
+    stop = np.minimum(there_and_back, 2 * n_stops - 2 - there_and_back)
+    line, along = np.divmod(stop, NADIR_LINE)
+    along = np.where(line % 2, NADIR_LINE - 1 - along, along)
+    grid = np.stack([along - (NADIR_LINE - 1) / 2, line - (NADIR_LINES - 1) / 2], -1)
+    xy = NADIR_STEP_M * grid + 0.03 * rng.standard_normal(grid.shape)
+    still = np.ones_like(frame)
+    yaw = rng.uniform(0, 2 * np.pi) * still
+    position = np.concatenate([xy, 1.8 * still[:, None]], axis=1)
+    return position, yaw, -np.pi / 2 * still, 0.0 * still
+
+
 TRAJECTORIES: dict[TrajectoryName, Callable[[FloatArray, np.random.Generator], Walk]] = {
     "handheld": _handheld,
     "orbit": _orbit,
     "corridor": _corridor,
+    "sideways": _sideways,
     "panorama": _panorama,
+    "forward": _forward,
+    "facing": _facing,
+    "nadir": _nadir,
     "static": _static,
 }

@@ -1,7 +1,7 @@
 """Feature tracks without images: the quick simulation for tests and studies.
 
-Points fill the room's walls and what stands before them; a pixel is the projection plus Gaussian
-noise, or an outlier. Occlusion is ignored. Nothing here needs open3d.
+Points fill a scene of `scenes.py`; a pixel is the projection plus Gaussian noise, or an outlier, as
+`keypoints.py` has them. Occlusion is ignored. Nothing here needs open3d.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,21 @@ import sfm_calib
 from graphs.camera import Camera, focal_on_axis, nominal_params, project
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
-from graphs.problem import Estimate, KnownBaseline, Observations, Problem
+from graphs.problem import Estimate, KnownBaseline, Observations, Problem, points_in_cameras
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.result import save_calibration, truth
+from sfm_calib.simulate.keypoints import (
+    OutlierKind,
+    draw_scales,
+    relative_noise,
+    with_outliers,
+)
 from sfm_calib.simulate.rigs import RigName, SimulatedRig, TrajectoryName, make_rig, make_trajectory
-from sfm_calib.simulate.room import ROOM_SIZE_M
+from sfm_calib.simulate.scenes import SceneName, scene_points
 
-WALL_DEPTH_M = 0.55  # how far points stand out from the walls
 NEAREST_M = 0.3  # features closer than this are out of focus
 MIN_OBSERVATIONS_A_FRAME = 6  # three points fix a frame; six leave something to check
-HEAVY_SCALE_PX, HEAVY_FREEDOM = 5.0, 2.0  # Student's t: no variance, as mismatches have none
 
 
 class TrackOptions(BaseModel):
@@ -43,6 +47,9 @@ class TrackOptions(BaseModel):
     """Cameras and how they sit on the rig."""
     trajectory: TrajectoryName = "handheld"
     """How the rig moves through the room."""
+    scene: SceneName = "room"
+    """Where the points are: in the whole room, on its wall at +y, on that wall without relief, or
+    on its floor."""
     frames: int = 40
     """How many images each camera takes."""
     size: tuple[int, int] = (640, 480)
@@ -50,7 +57,7 @@ class TrackOptions(BaseModel):
     lens: LensName = "radial"
     """Lens model of every camera."""
     points: int = 5000
-    """Points in the room; some are never seen."""
+    """Points in the scene; some are never seen."""
     max_points_per_image: int = 300
     """An image sees a random choice of its points, at most so many."""
     max_track_frames: int = 30
@@ -59,9 +66,11 @@ class TrackOptions(BaseModel):
     """Observations that a point needs to be kept."""
     sigma_px: float = 0.5
     """Gaussian noise of each pixel coordinate."""
+    noise_by_scale: bool = False
+    """Draw each keypoint a scale in px, known to the problem; coarse ones are noisier."""
     outlier_share: float = 0.0
     """Share of the observations that are wrong."""
-    outlier_kind: Literal["uniform", "heavy"] = "uniform"
+    outlier_kind: OutlierKind = "uniform"
     """uniform: anywhere in the image; heavy: Student's t around the right place."""
     focal_error: float = 0.03
     """Relative error of the initial focal length, the same for all cameras."""
@@ -88,7 +97,8 @@ def simulate_tracks(options: TrackOptions, rng: np.random.Generator) -> tuple[Pr
     check_options(options)
     rig = make_rig(options.rig, options.lens, options.size)
     rig_from_world = tuple(make_trajectory(options.trajectory, options.frames, rng))
-    whole = Estimate(rig.cameras, rig.cam_from_rig, rig_from_world, _points(options.points, rng))
+    points = scene_points(options.scene, options.points, rng)
+    whole = Estimate(rig.cameras, rig.cam_from_rig, rig_from_world, points)
     exact = _visible(whole, options, rng)
     kept = _well_observed(exact, options)
     if not len(kept):
@@ -96,18 +106,18 @@ def simulate_tracks(options: TrackOptions, rng: np.random.Generator) -> tuple[Pr
             f"no point of {options.points} is seen {options.min_track_length} times in "
             f"{options.frames} frames: give more points or frames, or a shorter min_track_length"
         )
-    frames, points = np.unique(kept.frame), np.unique(kept.point)
+    frames, seen = np.unique(kept.frame), np.unique(kept.point)
     true = replace(
         whole,
         rig_from_world=tuple(rig_from_world[f] for f in frames),
-        points=whole.points[points],
+        points=whole.points[seen],
     )
     numbered = replace(
         kept,
         frame=np.searchsorted(frames, kept.frame),
-        point=np.searchsorted(points, kept.point),
+        point=np.searchsorted(seen, kept.point),
     )
-    observations = _with_outliers(_with_noise(numbered, options, rng), options, rng)
+    observations = _with_errors(numbered, true, options, rng)
     names = tuple(f"{f:06d}" for f in frames)
     scale = _measured_baseline(rig, options, rng)
     return Problem(_perturbed(true, options, rng), observations, names, 0, scale), true
@@ -137,17 +147,6 @@ def check_options(options: TrackOptions) -> None:
         raise CalibrationError(
             f"focal_error is {options.focal_error}: give -0.9 to 10, like 0.03 for 3 %"
         )
-
-
-def _points(count: int, rng: np.random.Generator) -> FloatArray:
-    """Points (count, 3) within WALL_DEPTH_M of a wall, the floor or the ceiling."""
-    size = np.array(ROOM_SIZE_M)
-    kept = np.empty((0, 3))
-    while len(kept) < count:
-        inside = rng.uniform(0, 1, (2 * count, 3)) * size
-        wall = np.minimum(inside, size - inside).min(axis=1)
-        kept = np.concatenate([kept, inside[wall < WALL_DEPTH_M]])
-    return kept[:count] - [size[0] / 2, size[1] / 2, 0.0]
 
 
 def _visible(whole: Estimate, options: TrackOptions, rng: np.random.Generator) -> Observations:
@@ -192,25 +191,18 @@ def _well_observed(observations: Observations, options: TrackOptions) -> Observa
     return observations
 
 
-def _with_noise(
-    exact: Observations, options: TrackOptions, rng: np.random.Generator
+def _with_errors(
+    exact: Observations, true: Estimate, options: TrackOptions, rng: np.random.Generator
 ) -> Observations:
-    noise = options.sigma_px * rng.standard_normal(exact.pixels.shape)
-    return replace(exact, pixels=exact.pixels + noise)
-
-
-def _with_outliers(
-    observations: Observations, options: TrackOptions, rng: np.random.Generator
-) -> Observations:
-    count = round(options.outlier_share * len(observations))
-    wrong = rng.choice(len(observations), count, replace=False)
-    pixels = observations.pixels.copy()
-    last = np.array(options.size) - 1.0
-    if options.outlier_kind == "uniform":
-        pixels[wrong] = rng.uniform(0, 1, (count, 2)) * last
-    else:
-        pixels[wrong] += HEAVY_SCALE_PX * rng.standard_t(HEAVY_FREEDOM, (count, 2))
-    return replace(observations, pixels=pixels)
+    """The observations with noise, outliers and, where asked for, scales of the keypoints."""
+    scale, sigma_px = None, np.full(len(exact), options.sigma_px)
+    if options.noise_by_scale:
+        distance_m = np.linalg.norm(points_in_cameras(true, exact), axis=1)
+        scale = draw_scales(exact.point, distance_m, len(true.points), rng)
+        sigma_px = sigma_px * relative_noise(scale)
+    pixels = exact.pixels + sigma_px[:, None] * rng.standard_normal(exact.pixels.shape)
+    pixels = with_outliers(pixels, options.outlier_share, options.outlier_kind, options.size, rng)
+    return replace(exact, pixels=pixels, feature_scale=scale)
 
 
 def _perturbed(true: Estimate, options: TrackOptions, rng: np.random.Generator) -> Estimate:
@@ -273,6 +265,8 @@ def write_tracks(problem: Problem, true: Estimate, folder: Path) -> None:
         "sizes": np.array([camera.size for camera in cameras]),
         "reference": np.array(problem.reference),
     }
+    if problem.observations.feature_scale is not None:
+        arrays["feature_scale"] = problem.observations.feature_scale
     if isinstance(problem.scale, KnownBaseline):
         arrays["scale_cameras"] = np.array(problem.scale.cameras)
         arrays["scale"] = np.array([problem.scale.length_m, problem.scale.sigma_m])
@@ -327,7 +321,10 @@ def _problem_from(arrays: Arrays) -> Problem:
         scale = KnownBaseline((first, second), *arrays["scale"].tolist())
     return Problem(
         _estimate_from("initial", arrays),
-        Observations(*(arrays[name] for name in ("pixels", "frame", "camera", "point"))),
+        replace(
+            Observations(*(arrays[name] for name in ("pixels", "frame", "camera", "point"))),
+            feature_scale=arrays.get("feature_scale"),
+        ),
         tuple(arrays["frame_names"].tolist()),
         int(arrays["reference"]),
         scale,

@@ -1,0 +1,91 @@
+"""Which parameters hang on the choice of the lens, where held-out frames do not settle it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphs.camera import Camera, project, unproject
+from graphs.covariance import Covariance
+from graphs.frames import FloatArray, Transform
+from graphs.image_grid import image_grid
+from graphs.jackknife import change
+from graphs.ladder import Ladder, RungResult
+from graphs.problem import Estimate
+
+MOVED_SIGMAS = 1.0  # stated sigmas by which another lens has to move a parameter to be told
+
+
+@dataclass(frozen=True)
+class LensDoubt:
+    """A lens that predicts frames no worse than the chosen one, and what it would change."""
+
+    label: str  # of the rival
+    gain_px: float  # held-out error that it removes, not beyond chance or not worth its terms
+    gain_sigmas: float
+    parameters: tuple[str, ...]  # that it moves by more than MOVED_SIGMAS, the most moved first
+    moves: tuple[float, ...]  # in their own units
+    moves_sigmas: tuple[float, ...]
+    effect_px: float  # rms over the images, each turned as suits best
+    corner_px: float  # at the worst place of any image
+
+
+def lens_doubt(ladder: Ladder, stated: Covariance, unit: float = 1.0) -> LensDoubt | None:
+    """The rival that would change the picture most; None: none does as well and matters.
+
+    stated: of the final result, whose lengths are in `unit` of the estimates'.
+    """
+    best = ladder.best
+    rivals = [
+        rung
+        for rung in ladder.rungs[ladder.chosen + 1 :]
+        if rung.against == ladder.chosen and rung.gain_px > 0
+    ]
+    doubts = [doubt for rung in rivals if (doubt := _doubt(best, rung, stated, unit)) is not None]
+    return max(doubts, key=lambda doubt: doubt.effect_px, default=None)
+
+
+def _doubt(
+    best: RungResult, rival: RungResult, stated: Covariance, unit: float
+) -> LensDoubt | None:
+    shared = [
+        name
+        for name in stated.names
+        if ".translation_" not in name  # one of them is the unit
+        and name in best.covariance.stated.names
+        and name in rival.covariance.stated.names
+    ]
+    before, after = best.estimate.scaled(1 / unit), rival.estimate.scaled(1 / unit)
+    moved = dict(zip(shared, change(before, after, tuple(shared)), strict=True))
+    sigmas = {name: move / stated.sigma[name] for name, move in moved.items()}
+    named = sorted(
+        (name for name in shared if abs(sigmas[name]) > MOVED_SIGMAS),
+        key=lambda name: -abs(sigmas[name]),
+    )
+    if not named:
+        return None
+    effects = [_apart(a, b) for a, b in zip(before.cameras, after.cameras, strict=True)]
+    return LensDoubt(
+        rival.rung.label,
+        rival.gain_px,
+        rival.gain_sigmas,
+        tuple(named),
+        tuple(float(moved[name]) for name in named),
+        tuple(float(sigmas[name]) for name in named),
+        max(float(np.sqrt((effect**2).mean())) for effect in effects),
+        max(float(effect.max()) for effect in effects),
+    )
+
+
+def _apart(a: Camera, b: Camera) -> FloatArray:
+    """Lengths (n,) in px by which two cameras project the same rays apart, one turned as suits."""
+    alone = Estimate((a,), (Transform.identity(),), (), np.zeros((0, 3)))
+    grid = image_grid(alone, (), [np.inf])
+    apart = (project(b, unproject(a, grid.pixels)) - grid.pixels).reshape(-1)
+    seen = np.isfinite(apart)
+    turn = grid.by_rotation.reshape(-1, 3)[seen]
+    left = np.full(len(apart), np.nan)
+    left[seen] = apart[seen] - turn @ np.linalg.lstsq(turn, apart[seen])[0]
+    lengths: FloatArray = np.linalg.norm(left.reshape(-1, 2), axis=1)
+    return lengths[np.isfinite(lengths)]

@@ -1,0 +1,80 @@
+"""Two halves of a scan, each calibrated alone: do they agree as well as the sigmas claim?
+
+The idea is mrcal's cross-validation: what two calibrations project differently, once a rotation of
+the rig has undone what it can, is what really is uncertain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphs.build import CalibrationGraph
+from graphs.frames import FloatArray
+from graphs.image_grid import image_grid, typical_distances
+from graphs.jackknife import blocks_of, solve_part
+from graphs.problem import Estimate
+from graphs.stated_covariance import CalibrationCovariance, factors
+
+DRAWS, SEED = 20_000, 0  # of the distribution of what is expected
+SURPRISING = 0.01  # probability below which halves are said to disagree
+
+
+@dataclass(frozen=True)
+class SplitCheck:
+    """How far two halves project apart over all images, and how far the sigmas let expect."""
+
+    difference_px: float  # rms over the images, both coordinates together
+    expected_px: float  # rms that the stated covariances of the two halves predict
+    model_px: float  # the same of the model's
+    p_value: float  # probability of a larger difference, if the stated covariances are true
+
+    @property
+    def agrees(self) -> bool:
+        return self.p_value > SURPRISING
+
+
+def split_check(
+    graph: CalibrationGraph,
+    estimate: Estimate,
+    covariance: CalibrationCovariance,
+    min_parallax_deg: float,
+) -> SplitCheck | None:
+    """Solve every second block of frames, and the others, alone, and compare their projections.
+
+    The halves see the same points but no common image, and their observations are independent.
+    None where one of them does not determine the calibration.
+    """
+    model, second = covariance.basis, blocks_of(graph.problem) % 2 == 1
+    halves = [
+        solve_part(graph, estimate, model, frames, min_parallax_deg) for frames in (~second, second)
+    ]
+    if halves[0] is None or halves[1] is None:
+        return None
+    in_unit = estimate.scaled(1 / model.unit)
+    distances = typical_distances(in_unit, graph.problem.observations)
+    grid = image_grid(in_unit, model.names, distances.tolist()).settled
+    apart = grid @ (halves[0][0] - halves[1][0])
+    squared = float((apart**2).sum(-1).mean())
+    widening = _widening(model.matrix, covariance.stated.matrix)
+    of_halves = halves[0][1].matrix + halves[1][1].matrix
+    by_all = grid.reshape(-1, len(model.names)) / len(grid) ** 0.5
+    expected = by_all @ factors(widening @ of_halves @ widening.T)[0]
+    weights = np.linalg.svd(expected, compute_uv=False) ** 2
+    draws = np.random.default_rng(SEED).standard_normal((DRAWS, len(weights))) ** 2 @ weights
+    return SplitCheck(
+        squared**0.5,
+        float(weights.sum()) ** 0.5,
+        float(np.trace(by_all @ of_halves @ by_all.T)) ** 0.5,
+        float((np.count_nonzero(draws >= squared) + 1) / (DRAWS + 1)),
+    )
+
+
+def _widening(model: FloatArray, stated: FloatArray) -> FloatArray:
+    """T (n, n) with T M T' = S: how the model's errors have to be stretched to be the stated."""
+    root, whiten = factors(model)
+    values, vectors = np.linalg.eigh(whiten @ stated @ whiten.T)
+    stretch = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    result: FloatArray = root @ stretch @ whiten
+    return result

@@ -1,0 +1,126 @@
+"""The scan's twin: the same geometry and noise simulated anew, and calibrated again.
+
+Its truth is known, so it shows whether the stated sigmas cover for this very scan: where the
+geometry is too weak for sigmas to mean anything, or the loss does not suit the noise, they do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphs.build import GraphOptions
+from graphs.frames import FloatArray
+from graphs.jackknife import change
+from graphs.noise import redundancies
+from graphs.problem import Estimate, Problem, residuals_px
+from graphs.refine import Refinement, refine
+from graphs.scale import length_of
+from graphs.stated_covariance import calibration_covariance, factors
+
+INTERVAL = 1.959964  # sigmas to both sides that hold 95 %
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How the stated sigmas did on twins of a scan."""
+
+    names: tuple[str, ...]
+    z: FloatArray  # (n_trials, n) error over stated sigma
+    nees: FloatArray  # (n_trials,) squared error over the stated covariance, a degree of freedom
+    model_nees: FloatArray  # (n_trials,) the same over the model's
+    failed: int  # trials that could not be solved
+
+    @property
+    def coverage(self) -> FloatArray:
+        """Share (n,) of the trials whose 95 % interval holds the truth, of each parameter."""
+        result: FloatArray = (np.abs(self.z) < INTERVAL).mean(0)
+        return result
+
+    @property
+    def mean_nees(self) -> tuple[float, float]:
+        """Mean of `nees` over the trials, 1 where sigmas are true, and its standard error."""
+        return float(self.nees.mean()), float(self.nees.std(ddof=1) / len(self.nees) ** 0.5)
+
+
+def certify(
+    refinement: Refinement,
+    trials: int,
+    seed: int,
+    min_parallax_deg: float,
+    on_trial: Callable[[int, int], None] | None = None,
+) -> Certificate:
+    """Simulate, solve and judge a scan's twin so many times, two at least.
+
+    on_trial(done, total) is called after each. Raises ValueError when fewer than two succeed.
+    """
+    rng, options = np.random.default_rng(seed), refinement.graph.options
+    names: tuple[str, ...] = ()
+    judged: list[tuple[FloatArray, float, float]] = []
+    for number in range(trials):
+        twin = twin_problem(refinement, rng)
+        with suppress(ValueError):  # counted as failed
+            names, found = _judge(twin, refinement.estimate, options, min_parallax_deg)
+            judged.append(found)
+        if on_trial is not None:
+            on_trial(number + 1, trials)
+    if len(judged) < 2:
+        raise ValueError(
+            f"only {len(judged)} of {trials} simulated twins of this scan could be solved, and two "
+            "are needed: the scan hardly determines its cameras; give --certify more, or scan again"
+        )
+    z, nees, model_nees = (np.array(column) for column in zip(*judged, strict=True))
+    return Certificate(names, z, nees, model_nees, trials - len(judged))
+
+
+def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
+    """The optimum seen anew: exact projections, and lengths of noise drawn from the residuals'.
+
+    Directions are drawn evenly, each length is scaled by the sigma of its observation, and a
+    measured distance errs by its sigma.
+    """
+    problem, estimate = refinement.problem, refinement.estimate
+    seen = problem.observations
+    left = residuals_px(estimate, seen)
+    good = np.isfinite(left[:, 0])
+    relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma
+    before_fit = np.sqrt(redundancies(problem, refinement.graph.options))
+    lengths = (np.linalg.norm(left, axis=1) / relative / before_fit)[good]
+    drawn = rng.choice(lengths, len(seen)) * relative
+    angle = rng.uniform(0, 2 * np.pi, len(seen))
+    noise = drawn[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    exact = np.where(good[:, None], seen.pixels + left, seen.pixels)
+    scale = problem.scale
+    if scale is not None:
+        measured = length_of(scale, estimate) + scale.sigma_m * rng.standard_normal()
+        scale = replace(scale, length_m=measured)
+    return replace(
+        problem, initial=estimate, observations=replace(seen, pixels=exact + noise), scale=scale
+    )
+
+
+def _judge(
+    twin: Problem, truth: Estimate, options: GraphOptions, min_parallax_deg: float
+) -> tuple[tuple[str, ...], tuple[FloatArray, float, float]]:
+    """Names, z (n,) and NEES of the stated and the model covariance of one twin."""
+    found = refine(twin, options, min_parallax_deg, len(twin.observations))
+    covariance = calibration_covariance(found.graph, found.estimate, found.values, min_parallax_deg)
+    basis, unit = covariance.basis, 1.0
+    if basis.unit_camera is not None:
+        unit = float(np.linalg.norm(truth.cam_from_rig[basis.unit_camera].translation))
+    error = change(truth.scaled(1 / unit), found.estimate.scaled(1 / basis.unit), basis.names)
+    squared = [
+        float(((factors(matrix)[1] @ error) ** 2).mean())
+        for matrix in (covariance.stated.matrix, basis.matrix)
+    ]
+    sigma = np.sqrt(np.maximum(np.diag(covariance.stated.matrix), 1e-300))
+    return basis.names, (error / sigma, squared[0], squared[1])
+
+
+def worst(certificate: Certificate) -> Iterator[tuple[str, float]]:
+    """Parameters and their coverage, the least covered first."""
+    order = np.argsort(certificate.coverage, kind="stable")
+    yield from ((certificate.names[i], float(certificate.coverage[i])) for i in order)

@@ -1,0 +1,68 @@
+"""How well keypoints were located, by their size: large ones are blurred, and err more."""
+
+from __future__ import annotations
+
+import numpy as np
+import plotly.graph_objects as go
+
+from sfm_calib.report.digits import short
+from sfm_calib.report.theme import Panel, camera_colour, figure_html, plain, styled
+from sfm_calib.result import Calibration, NoiseBySize
+
+TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+Classes = dict[str, tuple[NoiseBySize, ...]]
+
+
+def noise_panel(calibration: Calibration) -> Panel | None:
+    """Noise against size, every camera; None where no size is known."""
+    by_size = calibration.noise.by_size if calibration.noise else {}
+    known = {name: _known(classes) for name, classes in by_size.items()}
+    if not any(known.values()):
+        return None
+    said = [_said(name, classes) for name, classes in known.items() if classes]
+    return Panel(
+        "Noise by the size of keypoints",
+        "Every observation is weighed by the noise of its camera and size. " + " ".join(said),
+        figure_html(noise_figure(known), "noise-by-size"),
+    )
+
+
+def _known(classes: tuple[NoiseBySize, ...]) -> tuple[NoiseBySize, ...]:
+    return tuple(one for one in classes if one.smallest_px and one.largest_px)
+
+
+def _said(name: str, classes: tuple[NoiseBySize, ...]) -> str:
+    if len(classes) == 1:
+        return f"{name}: {short(classes[0].sigma_px)} px for all."
+    first, last = classes[0], classes[-1]
+    return f"{name}: from {short(first.sigma_px)} px to {short(last.sigma_px)} px."
+
+
+def noise_figure(known: Classes) -> go.Figure:
+    """Sigma of one pixel coordinate against keypoint scale, a line a camera."""
+    figure = go.Figure()
+    for index, (name, classes) in enumerate(known.items()):
+        ends = np.array([(one.smallest_px, one.largest_px) for one in classes]).reshape(-1, 2)
+        figure.add_scatter(
+            x=np.sqrt(ends.prod(axis=1)).astype(np.float32),
+            y=np.array([one.sigma_px for one in classes], dtype=np.float32),
+            mode="lines+markers",
+            name=plain(name),
+            line={"color": camera_colour(index), "width": 2},
+            customdata=[
+                (f"{one.smallest_px:.2g} to {one.largest_px:.2g}", f"{one.n_observations:,}")
+                for one in classes
+            ],
+            hovertemplate="scale %{customdata[0]} px<br>sigma %{y:.3f} px"
+            "<br>%{customdata[1]} observations",
+        )
+    styled(figure, height=330)
+    figure.update_xaxes(
+        title="scale of the keypoint, px",
+        type="log",
+        tickvals=TICKS,
+        ticktext=[f"{tick:g}" for tick in TICKS],
+    )
+    figure.update_yaxes(title="sigma of one coordinate, px", rangemode="tozero")
+    figure.update_layout(showlegend=len(known) > 1)
+    return figure

@@ -1,0 +1,30 @@
+"""Everything a finished calibration knows of itself, for what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from graphs.ladder import Ladder
+from graphs.refine import Refinement
+from graphs.split_check import SplitCheck
+from graphs.stated_covariance import CalibrationCovariance
+from graphs.twin import Certificate
+from sfm_calib.config import RigConfig
+from sfm_calib.images import Scan
+from sfm_calib.mapping import Mapped
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything a finished calibration knows of itself."""
+
+    scan: Scan
+    config: RigConfig
+    mapped: Mapped
+    refinement: Refinement
+    covariance: CalibrationCovariance
+    seconds: dict[str, float]
+    command: str
+    ladder: Ladder | None = None
+    split: SplitCheck | None = None
+    certificate: Certificate | None = None

@@ -1,0 +1,181 @@
+"""Whether to use a result, and what to know before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from graphs.lens_doubt import lens_doubt
+from graphs.observability import WeakDirection, observe
+from graphs.problem import KnownSpan
+from graphs.remedies import listed_parameters
+from graphs.twin import Certificate, worst
+from sfm_calib import nominal, result
+from sfm_calib.run import Run
+
+FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
+CONTRADICTION = 4.0  # stated sigmas between a parameter and what rig.yaml says of it
+MANY_REJECTED = 0.25  # of the observations: 6 to 10 % in real scans that went well
+# Of sigma squared: a certificate holds where the mean NEES is between them, two of its standard
+# errors allowed.
+LEAST_NEES, MOST_NEES = 0.8, 1.3
+
+
+def verdict_of(run: Run) -> result.Verdict:
+    """The verdict on a finished calibration."""
+    refinement, covariance = run.refinement, run.covariance
+    observed = observe(
+        refinement.graph,
+        refinement.estimate,
+        covariance.stated,
+        covariance.model,
+        covariance.basis.unit,
+    )
+    reasons = list(observed.unusable)
+    if not refinement.summary.converged:
+        reasons.insert(0, f"the solve did not converge: {refinement.summary.reason}")
+    certificate = None if run.certificate is None else certificate_of(run.certificate)
+    messages = [f"not usable: {reason}" for reason in reasons]
+    messages += [*run.scan.warnings, *run.mapped.messages, *observed.lacks]
+    messages += _doubts(run) + _contradictions(run) + _lost_clicks(run)
+    if certificate is not None and not certificate.holds:
+        messages.append(
+            f"simulated twins of this scan err by {certificate.nees**0.5:.1f} of their stated "
+            f"sigmas (rms), and 95 % intervals hold {certificate.coverage:.0%} of the truths: its "
+            "sigmas cannot be relied on; take more frames, with more motion"
+        )
+    return result.Verdict(
+        usable=not reasons,
+        weak=(*(_weak(one) for one in observed.weak), *_of_lens(run)),
+        messages=tuple(messages),
+        split=None
+        if run.split is None
+        else result.Split(
+            difference_px=run.split.difference_px,
+            expected_px=run.split.expected_px,
+            p_value=run.split.p_value,
+            agrees=run.split.agrees,
+        ),
+        certificate=certificate,
+    )
+
+
+def certificate_of(certificate: Certificate) -> result.Certificate:
+    """What the twins showed, and whether the sigmas hold."""
+    mean, error = certificate.mean_nees
+    name, coverage = next(worst(certificate))
+    return result.Certificate(
+        trials=len(certificate.nees),
+        failed=certificate.failed,
+        nees=mean,
+        nees_standard_error=error,
+        model_nees=float(certificate.model_nees.mean()),
+        coverage=float(certificate.coverage.mean()),
+        least_covered=name,
+        least_coverage=coverage,
+        holds=LEAST_NEES - 2 * error < mean < MOST_NEES + 2 * error,
+    )
+
+
+def _weak(one: WeakDirection) -> result.WeakDirection:
+    return result.WeakDirection(
+        what=one.what,
+        effect_px=max(one.effect_centre_px, one.effect_corner_px),
+        remedy=one.remedy,
+        kind=one.kind,
+        parameters=one.parameters,
+        moves=one.moves,
+        slide_px=one.slide_px,
+        data_slide_px=one.data_slide_px if math.isfinite(one.data_slide_px) else None,
+        effect_centre_px=one.effect_centre_px,
+        effect_corner_px=one.effect_corner_px,
+        prior_share=one.prior_share,
+    )
+
+
+def _of_lens(run: Run) -> Iterator[result.WeakDirection]:
+    """What hangs on the lens, where frames held out cannot tell which it is."""
+    covariance, ladder = run.covariance, run.ladder
+    if ladder is None:
+        return
+    doubt = lens_doubt(ladder, covariance.stated, covariance.basis.unit)
+    if doubt is None:
+        return
+    by_sigmas = max(map(abs, doubt.moves_sigmas))
+    yield result.WeakDirection(
+        what=f"{listed_parameters(doubt.parameters, run.scan.cameras)}: which lens it is: "
+        f"{doubt.label} predicts frames held out as well as {ladder.best.rung.label} (removes "
+        f"{doubt.gain_px:.3f} px, {doubt.gain_sigmas:.1f} standard errors) and moves them up to "
+        f"{by_sigmas:.1f} stated sigmas",
+        effect_px=doubt.corner_px,
+        remedy="let things of the scene pass through the corners of the image, or say which lens "
+        "it is (lens)",
+        kind="choice of the lens",
+        parameters=doubt.parameters,
+        moves=doubt.moves,
+    )
+
+
+def _doubts(run: Run) -> list[str]:
+    """What makes the sigmas themselves doubtful."""
+    refinement, covariance, doubts = run.refinement, run.covariance, []
+    frames = len(refinement.problem.frame_names)
+    if frames < FEW_FRAMES:
+        doubts.append(
+            f"only {frames} frames: sigmas rest on how much frames differ, and fewer than "
+            f"{FEW_FRAMES} show that poorly; expect errors above the stated sigmas"
+        )
+    for first, last in covariance.jackknife.failed if covariance.jackknife else ():
+        doubts.append(
+            f"without the frames {first} to {last} the scan determines nothing: all hangs on "
+            "them; take more views like these"
+        )
+    if run.split is not None and not run.split.agrees:
+        doubts.append(
+            f"two halves of the frames, calibrated alone, project {run.split.difference_px:.2f} px "
+            f"apart, and the sigmas let expect {run.split.expected_px:.2f} px (p = "
+            f"{run.split.p_value:.2g}): something changed during the scan (zoom, focus, a mount), "
+            "or the sigmas are too small; calibrate parts of it"
+        )
+    kept = len(refinement.problem.observations)
+    rejected = refinement.n_rejected / max(kept + refinement.n_rejected, 1)
+    if rejected > MANY_REJECTED:
+        doubts.append(
+            f"{rejected:.0%} of the observations were set aside as mismatches ({MANY_REJECTED:.0%} "
+            "is much): look at the residuals; things that move, cameras out of step or a wrong "
+            "lens make such"
+        )
+    return doubts
+
+
+def _contradictions(run: Run) -> list[str]:
+    """Parameters that came out far from what rig.yaml states of them."""
+    found = []
+    for camera, prior in zip(
+        run.refinement.estimate.cameras, run.refinement.graph.lens_priors, strict=True
+    ):
+        stated = nominal.camera_config(run.config, camera.name).sigma
+        for name, value, mean in zip(camera.names, camera.params, prior.mean, strict=True):
+            if name in stated and abs(value - mean) > CONTRADICTION * stated[name]:
+                found.append(
+                    f"{camera.name}.{name} came out {abs(value - mean) / stated[name]:.0f} of its "
+                    f"stated sigmas from {mean:g}: the scan contradicts rig.yaml"
+                )
+    return found
+
+
+def _lost_clicks(run: Run) -> list[str]:
+    """Clicks on marks that were set aside as mismatches."""
+    said, problem = run.config.scale.points, run.refinement.problem
+    if said is None or not isinstance(problem.scale, KnownSpan):
+        return []
+    given = sum(map(len, said.between))
+    left = int(np.isin(problem.observations.point, problem.scale.points).sum())
+    if left == given:
+        return []
+    return [
+        f"{given - left} of {given} clicks on the marks of scale.points contradict the others and "
+        "were set aside: look at them again"
+    ]
