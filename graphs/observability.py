@@ -18,10 +18,10 @@ from graphs.build import CalibrationGraph
 from graphs.camera import focal_on_axis
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, reported_from_tangent
-from graphs.image_grid import ImageGrid, centre, corners, image_grid
+from graphs.image_grid import ImageGrid, centre, corners, image_grid, typical_distances
 from graphs.motion import Views, shared_lacks, views_of
 from graphs.motion import in_words as motion_in_words
-from graphs.problem import Estimate, IntArray, Problem, points_in_cameras
+from graphs.problem import Estimate, IntArray
 from graphs.propagation import lens_names, pose_names
 from graphs.remedies import NO_MOTION, Kind, Move, classify, in_words, remedy
 
@@ -79,7 +79,7 @@ def observe(
     """All there is to say of an optimum; unit: of the covariances' lengths, in the estimate's."""
     views = views_of(replace(graph.problem, initial=estimate))
     reported = estimate.scaled(1 / unit)
-    distances = typical_distances(replace(graph.problem, initial=reported))
+    distances = typical_distances(reported, graph.problem.observations).tolist()
     priors = prior_information(graph, estimate, stated.names, unit)
     weak = weak_directions(reported, stated, model, priors, distances, views)
     # A rig that only drives straight may have learned all there is; one that stands still has not.
@@ -158,13 +158,6 @@ def prior_information(
         of_tangent = np.diag(sigmas**-2.0)
         add(pose_names(estimate.cameras[index].name), from_reported.T @ of_tangent @ from_reported)
     return information
-
-
-def typical_distances(problem: Problem) -> tuple[float, ...]:
-    """Median distance from each camera of what it observed, at the problem's start."""
-    length = np.linalg.norm(points_in_cameras(problem.initial, problem.observations), axis=1)
-    camera, n = problem.observations.camera, len(problem.initial.cameras)
-    return tuple(float(np.median(length[camera == i])) for i in range(n))
 
 
 def prior_shares(model: Covariance, prior_information: FloatArray) -> dict[str, float]:

@@ -19,7 +19,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.calibrate import solve_problem
 from sfm_calib.config import RigConfig
 from sfm_calib.coverage_findings import coverage_findings
-from sfm_calib.errors import CalibrationError
+from sfm_calib.errors import BrokenDownError, CalibrationError
 from sfm_calib.findings import Finding, blurred_images, image_findings, solve_findings
 from sfm_calib.images import Progress, Scan, read_scan
 from sfm_calib.mapping import Mapped, map_scan
@@ -108,7 +108,8 @@ def _mapped(scan: Scan, config: RigConfig, cache: Cache, progress: Progress) -> 
     try:
         return map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
     except CalibrationError as error:
-        if error.__cause__ is not None:  # a full disk or a damaged cache: not the scan's fault
+        # A full disk, a damaged cache, memory that ran out: not the scan's fault.
+        if error.__cause__ is not None or isinstance(error, BrokenDownError):
             raise
         return _failure("mapping", error)
 

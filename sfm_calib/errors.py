@@ -12,6 +12,10 @@ class CalibrationError(Exception):
     """Bad input or an impossible request. The CLI prints it as one line and exits with 2."""
 
 
+class BrokenDownError(CalibrationError):
+    """What the machine did rather than the input: memory that ran out, a library that aborted."""
+
+
 def nearest(name: str, valid: Sequence[str]) -> str:
     """The valid name most like a wrong one, and all of them, or their ends where they are many."""
     close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)

@@ -127,7 +127,17 @@ def solve_findings(calibration: Calibration) -> list[Finding]:
         found += _focal_length(name, camera, chosen.sigma_factor if chosen else 1.0)
         found += _principal_point(name, camera)
         found += _direction(calibration, name)
-    for weak in calibration.verdict.weak if calibration.verdict else ():
+    verdict = calibration.verdict
+    for message in verdict.messages if verdict else ():
+        if message.startswith("not usable: rays"):
+            found.append(
+                Finding(
+                    camera=None, severity="cannot", topic="rays",
+                    what=message.removeprefix("not usable: "),
+                    remedy="let the camera move, turn and see things near and far",
+                )
+            )  # fmt: skip
+    for weak in verdict.weak if verdict else ():
         found.append(
             Finding(
                 camera=None,

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import IO, Any
 
 from sfm_calib import colmap
-from sfm_calib.errors import CalibrationError
+from sfm_calib.errors import BrokenDownError, CalibrationError
 from sfm_calib.images import Progress
 
 LOG_LINES = 200  # of the worker's stderr are kept for its epitaph
@@ -30,7 +30,7 @@ DISK_FULL = ("disk is full", "No space left on device")
 def run_apart(work: Callable[..., None], arguments: Sequence[object], progress: Progress) -> None:
     """Call `work(*arguments, progress)` in another process; a function of a module, and values.
 
-    Raises what `work` raises, OSError when it died of a full disk, and CalibrationError when it
+    Raises what `work` raises, OSError when it died of a full disk, and BrokenDownError when it
     died of anything else.
     """
     reading, writing = os.pipe()
@@ -101,12 +101,12 @@ def _cause_of_death(code: int, log: list[str]) -> BaseException:
     if any(sign in reason for sign in DISK_FULL):
         return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     if code == -signal.SIGKILL:
-        return CalibrationError(
+        return BrokenDownError(
             "COLMAP was killed, most likely because memory ran out: give a smaller --max-features, "
             "or use a machine with more memory"
         )
     how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    return CalibrationError(
+    return BrokenDownError(
         f"COLMAP broke down ({how}{': ' + reason if reason else ''}): run again with -v to see "
         "its log"
     )

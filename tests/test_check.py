@@ -16,7 +16,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.check import check_scan
 from sfm_calib.cli import main
 from sfm_calib.config import Options, RigConfig
-from sfm_calib.errors import CalibrationError
+from sfm_calib.errors import BrokenDownError, CalibrationError
 
 # ---- the story ---------------------------------------------------------------------------------
 
@@ -31,9 +31,9 @@ def pan(tmp_path):
     return tmp_path / "scan"
 
 
-def failing(monkeypatch, stage, message, cause=None):
+def failing(monkeypatch, stage, message, cause=None, kind=CalibrationError):
     def fail(*_):
-        raise CalibrationError(message) from cause
+        raise kind(message) from cause
 
     monkeypatch.setattr(check, stage, fail)
 
@@ -69,6 +69,12 @@ def test_a_failure_keeps_its_words(message, what, remedy):
 def test_a_full_disk_is_not_the_scans_fault(tmp_path, pan, monkeypatch):
     failing(monkeypatch, "map_scan", "cannot write cache: no space", OSError(28, "no space"))
     with pytest.raises(CalibrationError, match="no space"):
+        check_scan(pan, RigConfig(), Cache(tmp_path / "cache"), silent)
+
+
+def test_a_machine_that_breaks_down_is_not_the_scans_fault(tmp_path, pan, monkeypatch):
+    failing(monkeypatch, "map_scan", "COLMAP was killed: run again", kind=BrokenDownError)
+    with pytest.raises(BrokenDownError, match="killed"):
         check_scan(pan, RigConfig(), Cache(tmp_path / "cache"), silent)
 
 
