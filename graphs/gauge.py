@@ -105,7 +105,7 @@ def undetermined(
 
 
 INVOLVED = 0.1  # of the largest share that a variable has in a direction
-REMEDY = "take more views, moving sideways and turning, or hold it at a value"
+REMEDY = "take more views, moving sideways and turning, or state what you know of it in rig.yaml"
 
 
 def _name(problem: Problem, layout: Layout, column: int) -> str:

@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from graphs.build import CalibrationGraph, build
 from graphs.frames import FloatArray, log_rotation
 from graphs.model_covariance import ModelCovariance, model_covariance
-from graphs.problem import Estimate, IntArray, KnownPath, Problem
+from graphs.problem import Estimate, IntArray, KnownPath, KnownSpan, Problem
 from graphs.selection import select_tracks
 from graphs.solve import solve
+from graphs.unit import unit_jacobian
 
 # Neighbouring frames err alike. On the three real scans of the tests, 10 blocks of 5 frames moved
 # the focal lengths 1.2 to 1.5 times as far as 17 to 25 smaller ones would have it.
 BLOCKS = 10
-FRAMES_A_BLOCK = 2  # at least
+FRAMES_A_BLOCK = 2  # at least, where that leaves enough blocks; else single frames
 FEWEST_BLOCKS = 4  # fewer say next to nothing of how far they scatter
-STEPS, TOLERANCE = 20, 1e-6  # from the optimum of all, a few steps lead to that of the most
+STEPS, TOLERANCE = 50, 1e-6  # from the optimum of all, 3 to 6 steps lead to that of most frames
 
 
 @dataclass(frozen=True)
@@ -35,24 +36,29 @@ class Jackknife:
 
     names: tuple[str, ...]
     moved: FloatArray  # (n_blocks, n)
-    expected: (
-        FloatArray  # (n, n) sum over blocks of what the model covariance says of their squares
-    )
+    expected: FloatArray  # (n, n) sum over blocks of what noise alone has their squares be
     frames: tuple[tuple[str, str], ...]  # the first and the last frame of each block
     failed: tuple[tuple[str, str], ...]  # blocks without which nothing is determined
 
     @property
+    def weight(self) -> float:
+        """Of each block's squared move in the covariance; blocks that failed are as the others."""
+        n_blocks = len(self.moved) + len(self.failed)
+        return (n_blocks - 1) / len(self.moved)
+
+    @property
     def covariance(self) -> FloatArray:
         """The jackknife's own covariance (n, n), about the estimate from all frames."""
-        n_blocks = len(self.moved)
-        result: FloatArray = (n_blocks - 1) / n_blocks * self.moved.T @ self.moved
+        result: FloatArray = self.weight * self.moved.T @ self.moved
         return result
 
 
 def blocks_of(problem: Problem, most: int = BLOCKS) -> IntArray:
     """The block (n_frames,) of each frame, in the order of the scan, all about equally long."""
     n_frames = len(problem.frame_names)
-    count = max(min(most, n_frames // FRAMES_A_BLOCK), 1)
+    count = min(most, n_frames // FRAMES_A_BLOCK)
+    if count < min(most, FEWEST_BLOCKS):
+        count = min(most, n_frames)
     return np.arange(n_frames) * count // n_frames
 
 
@@ -82,7 +88,7 @@ def delete_group_jackknife(
             failed.append(ends)
         else:
             moved.append(part[0])
-            expected += part[1].matrix - model.matrix
+            expected += part[1].from_data - model.from_data
             kept.append(ends)
         if on_block is not None:
             on_block(number + 1, n_blocks)
@@ -100,24 +106,51 @@ def solve_part(
 ) -> tuple[FloatArray, ModelCovariance] | None:
     """How far the calibration (n,) moves with these frames (n_frames,) alone, and its covariance.
 
-    Both in the unit of `model`. None where these frames do not determine it.
+    Both in the unit of `model`. Frames that give the unit stay: the ends of a measured path, and
+    all with clicks. None where these frames do not determine the calibration.
     """
     problem = graph.problem
-    seen, scale = problem.observations, problem.scale
-    keep = frames[seen.frame]
-    if isinstance(scale, KnownPath):  # without one of its ends there is no unit
-        keep |= np.isin(seen.frame, scale.frames)
+    seen = problem.observations
+    keep = frames[seen.frame] | np.isin(seen.frame, _of_scale(problem))
     try:
         rest = select_tracks(
             replace(problem, initial=estimate, observations=seen.subset(keep)), min_parallax_deg
         )
         part = build(rest, graph.options)
-        found, values, _ = solve(part, STEPS, TOLERANCE, near=True)
-        covariance = model_covariance(part, found, values, model.unit_camera)
+        found, values, summary = solve(part, STEPS, TOLERANCE, near=True)
+        if not summary.converged:
+            return None
+        covariance = model_covariance(part, found, values, model)
     except ValueError:
         return None
     before, after = estimate.scaled(1 / model.unit), found.scaled(1 / covariance.unit)
-    return change(before, after, model.names), covariance
+    along = tangent(before, model)
+    return along @ change(before, after, model.names), replace(
+        covariance,
+        from_data=along @ covariance.from_data @ along.T,
+        of_priors=covariance.of_priors @ along.T,
+    )
+
+
+def tangent(in_unit: Estimate, model: ModelCovariance) -> FloatArray:
+    """Projection (n, n) of changes onto those that leave the unit of length as it is.
+
+    A baseline that is the unit stays on a sphere: what it turns by takes it off the plane that the
+    covariance lies in, by a second order that is large beside the rounding of a first order of 0.
+    """
+    if model.unit_camera is None:
+        return np.eye(len(model.names))
+    return unit_jacobian(model.names, in_unit, model.unit_camera)
+
+
+def _of_scale(problem: Problem) -> IntArray:
+    """Frames without which a measured distance gives no unit: of a path's ends, of clicks."""
+    scale, seen = problem.scale, problem.observations
+    if isinstance(scale, KnownPath):
+        return np.array(scale.frames)
+    if isinstance(scale, KnownSpan):
+        return np.unique(seen.frame[np.isin(seen.point, scale.points)])
+    return np.empty(0, np.int64)
 
 
 def change(estimate: Estimate, other: Estimate, names: tuple[str, ...]) -> FloatArray:

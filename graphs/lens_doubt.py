@@ -22,8 +22,9 @@ class LensDoubt:
     """A lens that predicts frames no worse than the chosen one, and what it would change."""
 
     label: str  # of the rival
-    gain_px: float  # held-out error that it removes, not beyond chance or not worth its terms
+    gain_px: float  # held-out error that it removes
     gain_sigmas: float
+    verdict: str  # why the ladder did not take it
     parameters: tuple[str, ...]  # that it moves by more than MOVED_SIGMAS, the most moved first
     moves: tuple[float, ...]  # in their own units
     moves_sigmas: tuple[float, ...]
@@ -31,10 +32,10 @@ class LensDoubt:
     corner_px: float  # at the worst place of any image
 
 
-def lens_doubt(ladder: Ladder, stated: Covariance, unit: float = 1.0) -> LensDoubt | None:
+def lens_doubt(ladder: Ladder, stated: Covariance) -> LensDoubt | None:
     """The rival that would change the picture most; None: none does as well and matters.
 
-    stated: of the final result, whose lengths are in `unit` of the estimates'.
+    stated: of the final result.
     """
     best = ladder.best
     rivals = [
@@ -42,13 +43,11 @@ def lens_doubt(ladder: Ladder, stated: Covariance, unit: float = 1.0) -> LensDou
         for rung in ladder.rungs[ladder.chosen + 1 :]
         if rung.against == ladder.chosen and rung.gain_px > 0
     ]
-    doubts = [doubt for rung in rivals if (doubt := _doubt(best, rung, stated, unit)) is not None]
+    doubts = [doubt for rung in rivals if (doubt := _doubt(best, rung, stated)) is not None]
     return max(doubts, key=lambda doubt: doubt.effect_px, default=None)
 
 
-def _doubt(
-    best: RungResult, rival: RungResult, stated: Covariance, unit: float
-) -> LensDoubt | None:
+def _doubt(best: RungResult, rival: RungResult, stated: Covariance) -> LensDoubt | None:
     shared = [
         name
         for name in stated.names
@@ -56,7 +55,7 @@ def _doubt(
         and name in best.covariance.stated.names
         and name in rival.covariance.stated.names
     ]
-    before, after = best.estimate.scaled(1 / unit), rival.estimate.scaled(1 / unit)
+    before, after = best.estimate, rival.estimate
     moved = dict(zip(shared, change(before, after, tuple(shared)), strict=True))
     sigmas = {name: move / stated.sigma[name] for name, move in moved.items()}
     named = sorted(
@@ -70,6 +69,7 @@ def _doubt(
         rival.rung.label,
         rival.gain_px,
         rival.gain_sigmas,
+        rival.verdict,
         tuple(named),
         tuple(float(moved[name]) for name in named),
         tuple(float(sigmas[name]) for name in named),

@@ -32,11 +32,17 @@ class ModelCovariance:
 
     names: tuple[str, ...]
     from_data: FloatArray  # (n, n) from the noise of the observations
-    from_priors: FloatArray  # (n, n) from how uncertain priors and the scale source are
+    of_priors: FloatArray  # (n_rows, n) what a sigma of each prior and scale source adds to them
     response: FloatArray  # (n_columns, n) what a unit of the cost's gradient does to them
     moments: LossMoments
     unit_camera: int | None  # whose baseline is the unit of length; None: the estimate's own unit
     unit: float  # that baseline in the estimate's unit, else 1
+
+    @property
+    def from_priors(self) -> FloatArray:
+        """The covariance (n, n) that priors and the scale source bring by being uncertain."""
+        result: FloatArray = self.of_priors.T @ self.of_priors
+        return result
 
     @property
     def matrix(self) -> FloatArray:
@@ -51,12 +57,12 @@ def model_covariance(
     graph: CalibrationGraph,
     estimate: Estimate,
     values: gtsam.Values,
-    unit_camera: int | None = None,
+    like: ModelCovariance | None = None,
 ) -> ModelCovariance:
     """Covariance of every free lens parameter and every cam_from_rig at the optimum.
 
-    Lens parameters that are held fixed and the reference camera are left out. unit_camera: whose
-    baseline is to be the unit, where the problem has no scale; the longest, where not given.
+    Lens parameters that are held fixed and the reference camera are left out. like: whose unit of
+    length to take, where the problem has no scale; without it, the longest baseline's.
     Raises ValueError when the problem determines less than it asks for.
     """
     moments = loss_moments(
@@ -65,7 +71,7 @@ def model_covariance(
     columns, names, to_reported = calibration_columns(graph, estimate)
     if not columns.size:  # everything is held
         nothing, response = np.zeros((0, 0)), np.zeros((graph.layout.elimination.n_columns, 0))
-        return ModelCovariance(names, nothing, nothing, response, moments, None, 1.0)
+        return ModelCovariance(names, nothing, np.zeros((0, 0)), response, moments, None, 1.0)
     others = graph.others.linearize(values)
     with threads() as pool:
         system = assemble(
@@ -79,19 +85,18 @@ def model_covariance(
         )
         response = responses(graph, system, columns)
     by_tangent, unit = to_reported, 1.0
-    if graph.problem.scale is None:
-        if unit_camera is None:
-            whole = Covariance(names, to_reported @ response[columns] @ to_reported.T)
-            unit_camera = baseline_unit(estimate, graph.problem.reference, whole)
-        if unit_camera is not None:
-            unit = float(np.linalg.norm(estimate.cam_from_rig[unit_camera].translation))
-            by_tangent = unit_jacobian(names, estimate, unit_camera) @ to_reported
+    unit_camera = None if like is None else like.unit_camera
+    if graph.problem.scale is None and like is None:
+        whole = Covariance(names, to_reported @ response[columns] @ to_reported.T)
+        unit_camera = baseline_unit(estimate, graph.problem.reference, whole)
+    if unit_camera is not None:
+        unit = float(np.linalg.norm(estimate.cam_from_rig[unit_camera].translation))
+        by_tangent = unit_jacobian(names, estimate, unit_camera) @ to_reported
     response = response @ by_tangent.T
     of_priors = jacobian_of(others, graph.layout)[0] @ response
-    from_priors = of_priors.T @ of_priors
-    from_data = (by_tangent @ response[columns] - from_priors) / moments.curvature
+    from_data = (by_tangent @ response[columns] - of_priors.T @ of_priors) / moments.curvature
     return ModelCovariance(
-        names, moments.score_variance * from_data, from_priors, response, moments,
+        names, moments.score_variance * from_data, of_priors, response, moments,
         unit_camera, unit,
     )  # fmt: skip
 

@@ -83,7 +83,10 @@ class Views:
 
 
 def views_of(problem: Problem) -> tuple[Views, ...]:
-    """What each camera's views are like, at the problem's start: best once it is solved."""
+    """What each camera's views are like, at the problem's start: best once it is solved.
+
+    A camera that sees nothing is left out.
+    """
     start, seen = problem.initial, problem.observations
     n = len(start.cameras)
     # A track of each camera by itself: what moves between frames, not between cameras.
@@ -99,6 +102,8 @@ def views_of(problem: Problem) -> tuple[Views, ...]:
     views = []
     for index, cam_from_rig in enumerate(start.cam_from_rig):
         rows = seen.camera == index
+        if not rows.any():
+            continue
         frames, points = np.unique(seen.frame[rows]), np.unique(seen.point[rows])
         R = cam_from_rig.rotation @ rotations[frames]
         t = translations[frames] @ cam_from_rig.rotation.T + cam_from_rig.translation

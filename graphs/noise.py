@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from graphs.build import GraphOptions
@@ -108,8 +109,8 @@ def noise_classes(
     """The noise of each camera by the size of its keypoints, from residuals (n_obs, 2) in px."""
     lengths = np.linalg.norm(residuals, axis=1) / np.sqrt(redundancies(problem, options))
     size, found = problem.observations.feature_scale, []
-    for camera, rows in _classes(problem):
-        sigma_px = float(np.nanmedian(lengths[rows])) / RAYLEIGH_MEDIAN
+    for camera, rows in _classes(problem, np.isfinite(lengths)):
+        sigma_px = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN
         ends = (0.0, np.inf) if size is None else (size[rows].min(), size[rows].max())
         found.append(NoiseClass(camera, float(ends[0]), float(ends[1]), len(rows), sigma_px))
     return tuple(found)
@@ -126,25 +127,27 @@ def with_class_sigmas(
     """
     seen = problem.observations
     lengths = residual_lengths(problem, residuals) / np.sqrt(redundancies(problem, options))
-    of_all = float(np.nanmedian(lengths)) / RAYLEIGH_MEDIAN
+    finite = np.isfinite(lengths)
+    of_all = float(np.median(lengths[finite])) / RAYLEIGH_MEDIAN if finite.any() else 0.0
     if not of_all > SMALLEST_SIGMA_PX:
         return problem
     relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma.copy()
-    for _, rows in _classes(problem):
-        factor = float(np.nanmedian(lengths[rows])) / RAYLEIGH_MEDIAN / of_all
+    for _, rows in _classes(problem, finite):
+        factor = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN / of_all
         relative[rows] *= np.clip(factor, 1 / WIDEST_FACTOR, WIDEST_FACTOR)
     return replace(problem, observations=replace(seen, relative_sigma=relative))
 
 
-def _classes(problem: Problem) -> Iterator[tuple[int, IntArray]]:
+def _classes(problem: Problem, projected: NDArray[np.bool_]) -> Iterator[tuple[int, IntArray]]:
     """Camera and rows of each class: half octaves of keypoint size, joined until large enough.
 
-    Observations whose size is not known, as those of clicked marks, are in none, unless no size is.
+    Observations that are not `projected` (n_obs,), and where some sizes are known those whose size
+    is not, as those of clicked marks, are in none.
     """
     seen = problem.observations
     for camera in range(len(problem.initial.cameras)):
-        rows = np.flatnonzero(seen.camera == camera)
-        if seen.feature_scale is not None:
+        rows = np.flatnonzero((seen.camera == camera) & projected)
+        if seen.feature_scale is not None and np.isfinite(seen.feature_scale).any():
             rows = rows[seen.feature_scale[rows] > 0]
             half_octave = np.floor(2 * np.log2(seen.feature_scale[rows]))
             rows = rows[np.argsort(half_octave, kind="stable")]

@@ -14,11 +14,14 @@ from graphs.build import CalibrationGraph
 from graphs.frames import FloatArray
 from graphs.image_grid import image_grid, typical_distances
 from graphs.jackknife import blocks_of, solve_part
+from graphs.model_covariance import ModelCovariance
 from graphs.problem import Estimate
 from graphs.stated_covariance import CalibrationCovariance, factors
 
 DRAWS, SEED = 20_000, 0  # of the distribution of what is expected
 SURPRISING = 0.01  # probability below which halves are said to disagree
+# Halves that may lie so far apart agree with anything: 3 to 5 px in the real scans.
+TOO_LITTLE_PX = 15.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,11 @@ def split_check(
 ) -> SplitCheck | None:
     """Solve every second block of frames, and the others, alone, and compare their projections.
 
-    The halves see the same points but no common image, and their observations are independent.
-    None where one of them does not determine the calibration.
+    The halves see the same points, but no common image other than those that give the unit.
+    None where one of them determines the calibration too little, and where nothing is estimated.
     """
+    if not covariance.basis.names:
+        return None
     model, second = covariance.basis, blocks_of(graph.problem) % 2 == 1
     halves = [
         solve_part(graph, estimate, model, frames, min_parallax_deg) for frames in (~second, second)
@@ -58,17 +63,27 @@ def split_check(
     apart = grid @ (halves[0][0] - halves[1][0])
     squared = float((apart**2).sum(-1).mean())
     widening = _widening(model.matrix, covariance.stated.matrix)
-    of_halves = halves[0][1].matrix + halves[1][1].matrix
+    of_halves = _of_difference(halves[0][1], halves[1][1])
     by_all = grid.reshape(-1, len(model.names)) / len(grid) ** 0.5
     expected = by_all @ factors(widening @ of_halves @ widening.T)[0]
     weights = np.linalg.svd(expected, compute_uv=False) ** 2
     draws = np.random.default_rng(SEED).standard_normal((DRAWS, len(weights))) ** 2 @ weights
+    expected_px = float(weights.sum()) ** 0.5
+    if expected_px > TOO_LITTLE_PX:
+        return None
     return SplitCheck(
         squared**0.5,
-        float(weights.sum()) ** 0.5,
+        expected_px,
         float(np.trace(by_all @ of_halves @ by_all.T)) ** 0.5,
         float((np.count_nonzero(draws >= squared) + 1) / (DRAWS + 1)),
     )
+
+
+def _of_difference(a: ModelCovariance, b: ModelCovariance) -> FloatArray:
+    """Covariance (n, n) of a less b, which lean on the same priors and the same measured length."""
+    shared = a.of_priors.T @ b.of_priors
+    result: FloatArray = a.matrix + b.matrix - shared - shared.T
+    return result
 
 
 def _widening(model: FloatArray, stated: FloatArray) -> FloatArray:

@@ -8,10 +8,10 @@ and cells of the image plane (a sandwich clustered in three ways); what whole bl
 share, and what is not linear, a delete-group jackknife does. Each is compared with what it would be
 if observations were independent, and the excess is added to the model's covariance:
 
-    stated = model + frames beyond it + tracks beyond it + cells beyond it,
+    stated = model + blocks of frames beyond it + tracks beyond it + cells beyond it,
 
 each shrunk as far as its few clusters leave its shape open. Where nothing errs together this is the
-model's covariance; it is never less.
+model's covariance; it is never less. Without blocks (few frames) single frames take their place.
 """
 
 from __future__ import annotations
@@ -90,6 +90,8 @@ def calibration_covariance(
     if not model.names:
         return CalibrationCovariance(model.covariance, model.covariance, None, model)
     root, whiten = _of_data(model)
+    if not len(whiten):  # priors decide everything
+        return CalibrationCovariance(model.covariance, model.covariance, None, model)
     with threads() as pool:
         points = homogeneous(graph.tracks, estimate.points)
         shared = shared_errors(
@@ -126,7 +128,7 @@ def _of_data(model: ModelCovariance) -> tuple[FloatArray, FloatArray]:
 
 
 def _of_frames(shared: SharedErrors) -> FloatArray:
-    """What frames err together, in units of the model's covariance, less what they would alone."""
+    """What frames err together, in units of the data's covariance, less what they would alone."""
     seen = shared.by_frame[shared.by_frame.any(axis=1)]
     if len(seen) < MIN_FRAMES:
         return np.zeros_like(shared.by_track)
@@ -156,16 +158,17 @@ def _of_blocks(jackknife: Jackknife, whiten: FloatArray) -> FloatArray:
     """What blocks of frames err together beyond what the model expects of the jackknife.
 
     Of so few blocks an excess of the size of its own standard error is none: it is shrunk as James
-    and Stein shrink a mean (1961).
+    and Stein shrink a mean (1961). What is left is itself a guess, and as many times larger as
+    Student's t of so many degrees of freedom spreads more than a Gaussian.
     """
     n_blocks, n = len(jackknife.moved), len(whiten)
     scatter = whiten @ jackknife.covariance @ whiten.T
-    expected = (n_blocks - 1) / n_blocks * np.trace(whiten @ jackknife.expected @ whiten.T) / n
-    of_blocks = (n_blocks - 1) / n * ((jackknife.moved @ whiten.T) ** 2).sum(1)
+    expected = jackknife.weight * np.trace(whiten @ jackknife.expected @ whiten.T) / n
+    of_blocks = n_blocks * jackknife.weight / n * ((jackknife.moved @ whiten.T) ** 2).sum(1)
     excess, error = of_blocks.mean() - expected, of_blocks.std(ddof=1) / n_blocks**0.5
     if excess <= error:
         return np.zeros((n, n))
-    kept = 1 - (error / excess) ** 2
+    kept = (1 - (error / excess) ** 2) * n_blocks / (n_blocks - 2)
     result: FloatArray = kept * (shrunk(scatter, n_blocks) - expected * np.eye(n))
     return result
 

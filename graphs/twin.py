@@ -14,7 +14,8 @@ import numpy as np
 
 from graphs.build import GraphOptions
 from graphs.frames import FloatArray
-from graphs.jackknife import change
+from graphs.jackknife import change, tangent
+from graphs.model_covariance import calibration_columns
 from graphs.noise import redundancies
 from graphs.problem import Estimate, Problem, residuals_px
 from graphs.refine import Refinement, refine
@@ -51,19 +52,23 @@ def certify(
     trials: int,
     seed: int,
     min_parallax_deg: float,
+    adaptive: bool = False,
     on_trial: Callable[[int, int], None] | None = None,
 ) -> Certificate:
     """Simulate, solve and judge a scan's twin so many times, two at least.
 
-    on_trial(done, total) is called after each. Raises ValueError when fewer than two succeed.
+    adaptive: as it was in `refine`. on_trial(done, total) is called after each. Raises ValueError
+    when fewer than two succeed, and when every parameter is held.
     """
     rng, options = np.random.default_rng(seed), refinement.graph.options
     names: tuple[str, ...] = ()
     judged: list[tuple[FloatArray, float, float]] = []
+    if not calibration_columns(refinement.graph, refinement.estimate)[0].size:
+        raise ValueError("every parameter is held: there is no sigma to certify; leave certify out")
     for number in range(trials):
         twin = twin_problem(refinement, rng)
         with suppress(ValueError):  # counted as failed
-            names, found = _judge(twin, refinement.estimate, options, min_parallax_deg)
+            names, found = _judge(twin, refinement.estimate, options, min_parallax_deg, adaptive)
             judged.append(found)
         if on_trial is not None:
             on_trial(number + 1, trials)
@@ -103,15 +108,20 @@ def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
 
 
 def _judge(
-    twin: Problem, truth: Estimate, options: GraphOptions, min_parallax_deg: float
+    twin: Problem,
+    truth: Estimate,
+    options: GraphOptions,
+    min_parallax_deg: float,
+    adaptive: bool,
 ) -> tuple[tuple[str, ...], tuple[FloatArray, float, float]]:
     """Names, z (n,) and NEES of the stated and the model covariance of one twin."""
-    found = refine(twin, options, min_parallax_deg, len(twin.observations))
+    found = refine(twin, options, min_parallax_deg, len(twin.observations), adaptive=adaptive)
     covariance = calibration_covariance(found.graph, found.estimate, found.values, min_parallax_deg)
     basis, unit = covariance.basis, 1.0
     if basis.unit_camera is not None:
         unit = float(np.linalg.norm(truth.cam_from_rig[basis.unit_camera].translation))
-    error = change(truth.scaled(1 / unit), found.estimate.scaled(1 / basis.unit), basis.names)
+    in_unit, after = truth.scaled(1 / unit), found.estimate.scaled(1 / basis.unit)
+    error = tangent(in_unit, basis) @ change(in_unit, after, basis.names)
     squared = [
         float(((factors(matrix)[1] @ error) ** 2).mean())
         for matrix in (covariance.stated.matrix, basis.matrix)

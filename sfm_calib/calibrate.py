@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from graphs.build import GraphOptions
 from graphs.ladder import Ladder, climb, on_rung_of
 from graphs.losses import SCALE_95, LossName
@@ -36,6 +38,9 @@ from sfm_calib.nominal import (
 from sfm_calib.result import Calibration
 from sfm_calib.run import Run
 from sfm_calib.summary import summarise
+
+FEW_PLACED = 0.5  # of the images: of scans that went well, nine in ten and more are
+FRAMES_TO_JUDGE = 6  # fewer, placed together, do not show how a rig moved through its scan
 
 
 @dataclass
@@ -77,12 +82,13 @@ def calibrate(
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
     problem = start_from_config(mapped.problem, config)
-    with watch.stage("choosing the lens"):
-        ladder = choose_lens(problem, config, progress)
-    with watch.stage("solving"):
-        refinement = solve_problem(problem, config, progress, ladder)
-    with watch.stage("covariance"):
-        covariance, split = covariance_of(refinement, config, progress)
+    with enough_placed(problem, len(scan.images)):
+        with watch.stage("choosing the lens"):
+            ladder = choose_lens(problem, config, progress)
+        with watch.stage("solving"):
+            refinement = solve_problem(problem, config, progress, ladder)
+        with watch.stage("covariance"):
+            covariance, split = covariance_of(refinement, config, progress)
     with watch.stage("certificate"):
         certificate = certificate_of(refinement, config, progress)
     run = Run(
@@ -144,12 +150,31 @@ def solve_problem(
 
 
 @contextmanager
+def enough_placed(problem: Problem, n_images: int) -> Iterator[None]:
+    """Where most images could not be placed, that is what is wrong with a scan that is refused."""
+    try:
+        yield
+    except CalibrationError as error:
+        seen = problem.observations
+        placed = len(np.unique(seen.frame * len(problem.initial.cameras) + seen.camera))
+        if placed >= FEW_PLACED * n_images:
+            raise
+        raise CalibrationError(
+            f"only {placed} of {n_images} images could be placed, too few to calibrate from: take "
+            "the views closer together, and let them see textured things"
+        ) from error
+
+
+@contextmanager
 def _refusals(problem: Problem) -> Iterator[None]:
     """What the maths refuses, in one line; a scan without motion is called by its name."""
     try:
         yield
     except ValueError as error:
-        why = too_little_motion(problem, parallax_found=not isinstance(error, NoParallaxError))
+        why = None
+        if len(problem.frame_names) >= FRAMES_TO_JUDGE:
+            no_parallax = isinstance(error, NoParallaxError)
+            why = too_little_motion(problem, parallax_found=not no_parallax)
         raise CalibrationError(why or str(error)) from error
 
 
@@ -179,6 +204,7 @@ def certificate_of(
     try:
         return certify(
             refinement, config.certify, config.seed, config.min_parallax_deg,
+            adaptive=config.loss == "adaptive",
             on_trial=lambda done, total: progress("certifying", done, total),
         )  # fmt: skip
     except ValueError as error:

@@ -96,7 +96,6 @@ def check_scan(scan_path: Path, config: RigConfig, cache: Cache, progress: Progr
     covered = coverage(problem, config.min_parallax_deg, lit)
     found += coverage_findings(scan, problem.frame_names, covered)
     solved = _solved(scan, config, mapped, progress)
-    # Weak directions (graphs.observability: solved.verdict.weak) are to be added to these.
     found += [solved] if isinstance(solved, Finding) else solve_findings(solved)
     messages = (*scan.warnings, *mapped.messages)
     calibration = None if isinstance(solved, Finding) else solved

@@ -202,16 +202,17 @@ def _messages(scan: Scan, model: FreeModel, dropped: list[tuple[int, int]]) -> t
     lost = [scan.name(i) for i in scan.images if (i.camera, i.frame) not in model.cam_from_world]
     if lost:
         messages.append(
-            f"{len(lost)} of {len(scan.images)} images could not be placed: {_some(lost)}"
+            f"{len(lost)} of {len(scan.images)} images could not be placed: {some(lost)}"
         )
     odd = [f"{scan.cameras[camera]}/{scan.frames[frame]}" for camera, frame in dropped]
     if odd:
         messages.append(
             f"{len(odd)} images contradict the rig and were dropped (a wrong place, or not taken "
-            f"together with the rest of their frame): {_some(odd)}"
+            f"together with the rest of their frame): {some(odd)}"
         )
     return tuple(messages)
 
 
-def _some(names: list[str]) -> str:
+def some(names: list[str]) -> str:
+    """The first five names, and how many more there are."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

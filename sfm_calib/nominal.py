@@ -74,9 +74,11 @@ def check_config(config: RigConfig, scan: Scan) -> None:
         valid = PARAMETER_NAMES[lens]
         for parameter in [*entry.params, *entry.sigma, *entry.fixed]:
             if parameter not in valid:
+                unsaid = entry.lens is None and config.lens == "auto"
+                advice = "say which lens it has (lens: brown, ...)" if unsaid else ""
                 raise CalibrationError(
                     f"rig.yaml gives camera {name} a parameter {parameter!r} that its lens "
-                    f"{lens} does not have; {nearest(parameter, valid)}"
+                    f"{lens} does not have; {advice or nearest(parameter, valid)}"
                 )
         for parameter in entry.sigma:
             if parameter not in entry.params:

@@ -9,14 +9,16 @@ import numpy as np
 
 from graphs.lens_doubt import lens_doubt
 from graphs.observability import WeakDirection, observe
-from graphs.problem import KnownSpan
+from graphs.problem import KnownSpan, Problem
 from graphs.remedies import listed_parameters
 from graphs.twin import Certificate, worst
 from sfm_calib import nominal, result
+from sfm_calib.mapping import some
 from sfm_calib.run import Run
 
 FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
 CONTRADICTION = 4.0  # stated sigmas between a parameter and what rig.yaml says of it
+LOOSE_SCALE = 0.1  # of the measured distance: of a tape measure it is a hundredth
 MANY_REJECTED = 0.25  # of the observations: 6 to 10 % in real scans that went well
 # Of sigma squared: a certificate holds where the mean NEES is between them, two of its standard
 # errors allowed.
@@ -100,15 +102,14 @@ def _of_lens(run: Run) -> Iterator[result.WeakDirection]:
     covariance, ladder = run.covariance, run.ladder
     if ladder is None:
         return
-    doubt = lens_doubt(ladder, covariance.stated, covariance.basis.unit)
+    doubt = lens_doubt(ladder, covariance.stated)
     if doubt is None:
         return
     by_sigmas = max(map(abs, doubt.moves_sigmas))
     yield result.WeakDirection(
         what=f"{listed_parameters(doubt.parameters, run.scan.cameras)}: which lens it is: "
-        f"{doubt.label} predicts frames held out as well as {ladder.best.rung.label} (removes "
-        f"{doubt.gain_px:.3f} px, {doubt.gain_sigmas:.1f} standard errors) and moves them up to "
-        f"{by_sigmas:.1f} stated sigmas",
+        f"{doubt.label} predicts frames held out no worse than {ladder.best.rung.label}, was not "
+        f"taken ({doubt.verdict}), and would move these by up to {by_sigmas:.1f} stated sigmas",
         effect_px=doubt.corner_px,
         remedy="let things of the scene pass through the corners of the image, or say which lens "
         "it is (lens)",
@@ -139,6 +140,17 @@ def _doubts(run: Run) -> list[str]:
             f"{run.split.p_value:.2g}): something changed during the scan (zoom, focus, a mount), "
             "or the sigmas are too small; calibrate parts of it"
         )
+    if run.ladder is not None and run.ladder.n_frames < 2:
+        doubts.append(
+            f"the lens {run.ladder.best.rung.label} is a guess: no frame could be held out to "
+            "judge it by; take more views, or say which lens it is (lens)"
+        )
+    before, after = _images_of(run.mapped.problem), _images_of(refinement.problem)
+    if lost := sorted(before - after):
+        doubts.append(
+            f"{len(lost)} images see too few points that are consistent between views, and were "
+            f"left out: {some(lost)}"
+        )
     kept = len(refinement.problem.observations)
     rejected = refinement.n_rejected / max(kept + refinement.n_rejected, 1)
     if rejected > MANY_REJECTED:
@@ -150,19 +162,40 @@ def _doubts(run: Run) -> list[str]:
     return doubts
 
 
+def _images_of(problem: Problem) -> set[str]:
+    """The images that a problem has observations of, as `camera/frame`."""
+    seen, cameras = problem.observations, problem.initial.cameras
+    places = np.unique(np.stack([seen.camera, seen.frame]), axis=1)
+    return {f"{cameras[c].name}/{problem.frame_names[f]}" for c, f in places.T}
+
+
 def _contradictions(run: Run) -> list[str]:
-    """Parameters that came out far from what rig.yaml states of them."""
+    """Parameters that came out far from what rig.yaml states of them, or from its beliefs."""
     found = []
     for camera, prior in zip(
         run.refinement.estimate.cameras, run.refinement.graph.lens_priors, strict=True
     ):
         stated = nominal.camera_config(run.config, camera.name).sigma
-        for name, value, mean in zip(camera.names, camera.params, prior.mean, strict=True):
-            if name in stated and abs(value - mean) > CONTRADICTION * stated[name]:
-                found.append(
-                    f"{camera.name}.{name} came out {abs(value - mean) / stated[name]:.0f} of its "
-                    f"stated sigmas from {mean:g}: the scan contradicts rig.yaml"
-                )
+        for name, value, mean, sigma, free in zip(
+            camera.names, camera.params, prior.mean, prior.sigma, prior.free, strict=True
+        ):
+            apart = abs(value - mean) / sigma if free else 0.0
+            if apart <= CONTRADICTION:
+                continue
+            what = f"{camera.name}.{name} came out {apart:.0f} "
+            if name in stated:
+                what += f"of its stated sigmas from {mean:g}: the scan contradicts rig.yaml"
+            elif name in ("cx", "cy"):
+                what += f"sigmas of principal_point_sigma from {mean:g} px: give a larger one"
+            else:
+                continue
+            found.append(what)
+    scale = run.refinement.problem.scale
+    if scale is not None and scale.sigma_m > LOOSE_SCALE * scale.length_m:
+        found.append(
+            f"the measured distance is known to {scale.sigma_m / scale.length_m:.0%} only, and "
+            "with it every length: measure it better"
+        )
     return found
 
 

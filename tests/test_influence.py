@@ -15,6 +15,7 @@ from graphs.frames import FloatArray
 from graphs.influence import CELLS, Influence, SharedErrors, shared_errors
 from graphs.losses import LossName, weight_and_slope
 from graphs.model_covariance import calibration_columns
+from graphs.noise import LEAST_REDUNDANCY
 from graphs.problem import IntArray
 from graphs.solve import solve, threads
 
@@ -47,6 +48,17 @@ def test_sums_over_clusters_by_hand() -> None:
         assert sums.alone == pytest.approx((moved**2).sum())
         left = np.array([0.5, 0.5, 0.5, 1 - 1.5 / 4, 0.1])  # of two with one's threefold weight
         assert sums.before_fit == pytest.approx((moved[:, 0] ** 2 / left).sum())
+
+
+def test_frames_of_a_cluster_find_their_place_among_all() -> None:
+    """A cluster of two of five frames, in no order."""
+    total, part = SharedErrors(5, 1, 2), SharedErrors(2, 1, 2)
+    moved, begins = np.array([[1.0, 2], [3, 4], [5, 6]]), np.array([0])
+    part.add(influence(moved, begins), np.array([0, 0, 1]), np.zeros(3, np.int64), np.ones(3))
+    total.merge(part, np.array([3, 1]))
+    np.testing.assert_array_equal(total.by_frame, [[0, 0], [5, 6], [0, 0], [4, 6], [0, 0]])
+    total.merge(part, np.array([1, 4]))
+    np.testing.assert_array_equal(total.by_frame, [[0, 0], [9, 12], [0, 0], [4, 6], [5, 6]])
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -92,3 +104,8 @@ def test_shared_errors_are_those_of_dense_algebra(
     same(ours.by_track, of_tracks.T @ of_tracks)
     assert ours.alone == pytest.approx((moved**2).sum(), rel=1e-5)
     assert ours.n_tracks == len(np.unique(seen.point))
+    # a point takes three coordinates of its track, by the observations' own weights
+    of_track = np.bincount(seen.point, sigma**-2)[seen.point]
+    left = np.maximum(1 - 1.5 * sigma**-2 / of_track, LEAST_REDUNDANCY)
+    expected = ((moved**2).sum(1) / left).sum()
+    assert ours.before_fit == pytest.approx(expected, rel=1e-5)

@@ -11,7 +11,6 @@ from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.frames import FloatArray, Transform, exp_rotation
 from graphs.jackknife import (
     BLOCKS,
-    FEWEST_BLOCKS,
     Jackknife,
     blocks_of,
     change,
@@ -56,8 +55,9 @@ def test_blocks_are_runs_of_frames_about_equally_long() -> None:
     assert len(count) == BLOCKS and count.min() == 2 and count.max() == 3
     assert (np.diff(blocks_of(problem)) >= 0).all()
     assert blocks_of(problem, 2).tolist() == [0] * 12 + [1] * 11
-    few = replace(problem, frame_names=problem.frame_names[:7])
-    assert np.bincount(blocks_of(few)).tolist() == [3, 2, 2]
+    for frames, sizes in ((8, [2] * 4), (7, [1] * 7), (3, [1] * 3)):
+        few = replace(problem, frame_names=problem.frame_names[:frames])
+        assert np.bincount(blocks_of(few)).tolist() == sizes
 
 
 def test_changes_are_those_of_the_reported_parameters() -> None:
@@ -138,9 +138,9 @@ def test_what_frames_err_together_moves_more() -> None:
     assert np.median(beyond(found) / beyond(plain)) > 3
 
 
-def test_too_few_frames_make_no_blocks() -> None:
-    problem = problem_of(frames=2 * FEWEST_BLOCKS - 1, points=2000)
-    graph, estimate, model = solved(problem)
+def test_too_few_frames_make_no_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graphs.jackknife.FEWEST_BLOCKS", 7)
+    graph, estimate, model = solved(problem_of(frames=6, points=2000))
     assert delete_group_jackknife(graph, estimate, model, 1.0) is None
 
 
@@ -171,3 +171,24 @@ def test_the_ends_of_a_measured_path_stay() -> None:
     assert found.failed == ()
     place = found.names.index("cam1.translation_x")
     assert np.isfinite(found.moved).all() and np.abs(found.moved[:, place]).max() < 0.05
+
+
+def test_shared_lenses_move_as_one() -> None:
+    problem = problem_of()
+    graph = build(problem, GraphOptions(SIGMA_PX, shared_lenses=((0, 1),)))
+    estimate, values, _ = solve(graph)
+    model = model_covariance(graph, estimate, values)
+    part = solve_part(graph, estimate, model, np.arange(20) > 3, 1.0)
+    assert part is not None
+    moved = dict(zip(model.names, part[0], strict=True))
+    for name in estimate.cameras[0].names:
+        assert moved[f"cam0.{name}"] == moved[f"cam1.{name}"] != 0
+
+
+def test_a_part_takes_the_unit_of_the_whole() -> None:
+    """Where the whole found no baseline worth being one, its parts have none either."""
+    graph, estimate, model = solved(problem_of())
+    none = replace(model, unit_camera=None, unit=1.0)
+    part = solve_part(graph, estimate, none, np.arange(20) > 3, 1.0)
+    assert part is not None
+    assert part[1].unit_camera is None and part[1].unit == 1.0

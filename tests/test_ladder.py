@@ -4,24 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import t as student
 
 import graphs.held_out
 from graphs.build import GraphOptions
 from graphs.camera import Camera, nominal_params
+from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.held_out import held_out_costs, resected, well_seen
 from graphs.ladder import (
     LEAST_GAIN_PX,
     NARROW,
+    SIGNIFICANCE,
     TAKEN,
     UNJUDGED,
     WIDE,
     Ladder,
     Rung,
+    _judged,
+    _Trial,
+    _verdict,
+    _weak,
     climb,
     on_rung_of,
     paired_gain,
@@ -298,6 +306,70 @@ def test_what_is_seen_well_is_a_fixed_point() -> None:
     in_frame = np.bincount(seen.frame[keep])
     assert length[length > 0].min() >= MIN_TRACK_LENGTH
     assert in_frame[in_frame > 0].min() >= graphs.held_out.MIN_IN_FRAME
+
+
+def test_a_frame_that_sees_little_is_not_predicted() -> None:
+    problem, true = scanned("simple_radial", {"k1": K1}, rig="mono", frames=8, points=300)
+    seen = problem.observations
+    options, well = GraphOptions(SIGMA_PX), well_seen(seen, seen.frame % 4 != 2)
+    known = np.isin(seen.point, seen.point[well])  # without the fold of frame 2
+    for count, told in ((graphs.held_out.MIN_IN_FRAME, True), (8, False)):
+        few = np.flatnonzero((seen.frame == 2) & known)[:count]
+        keep = np.isin(np.arange(len(seen)), few) | (seen.frame != 2)
+        thin = replace(problem, initial=true, observations=seen.subset(keep))
+        costs = held_out_costs(thin, options, 4)
+        assert np.isfinite(costs[thin.observations.frame == 2]).all() == told
+        assert np.isfinite(costs[thin.observations.frame == 1]).mean() > 0.5
+
+
+# ---- what refuses a rung -------------------------------------------------------------------
+
+
+def test_every_condition_refuses_by_itself() -> None:
+    good = {"gain_px": 0.03, "least_px": 0.01, "gain_sigmas": 4.0, "n_frames": 20, "weak": ()}
+    needed = student.ppf(1 - SIGNIFICANCE, 19)  # one-sided, the frames are the sample
+    assert _verdict(**good) == _verdict(**good | {"gain_sigmas": needed + 0.01}) == TAKEN
+    for changed, words in (
+        ({"n_frames": 1}, "not judged"),
+        ({"gain_px": -0.03}, "no better"),
+        ({"gain_px": 0.009}, "removes 0.009 px, less than the 0.010 px"),
+        ({"gain_sigmas": needed - 0.01}, f"better by {needed - 0.01:.1f} standard errors, less"),
+        ({"weak": ("cam0.k3", "cam1.k3")}, "leaves cam0.k3, cam1.k3 undetermined"),
+    ):
+        assert _verdict(**good | changed).startswith(words)
+
+
+def trial(rung: Rung, cost: float, model: float = 1e-4, stated: float = 1e-4) -> _Trial:
+    """Of one camera: the same cost in 30 frames, but for a little; sigmas of its last term."""
+    camera = Camera("cam0", rung.lens, (640, 480), nominal_params(rung.lens, (640, 480), 500.0))
+    name = (f"cam0.{rung.coefficients[-1]}",)
+    sigmas = (Covariance(name, np.array([[sigma**2]])) for sigma in (model, stated))
+    covariance = SimpleNamespace(**dict(zip(("model", "stated"), sigmas, strict=True)))
+    graph = SimpleNamespace(
+        problem=SimpleNamespace(observations=SimpleNamespace(frame=np.arange(300) % 30))
+    )
+    costs = cost * (1 + 1e-6 * np.random.default_rng(len(rung.coefficients)).random(300))
+    return _Trial(rung, graph, SimpleNamespace(cameras=(camera,)), covariance, costs)
+
+
+def test_more_coefficients_have_to_gain_more() -> None:
+    """As the root of their number: 0.012 px is enough for one, not for two."""
+    one, two, four = Rung("simple_radial"), Rung("radial"), Rung("radtan")
+    gain = 0.012**2
+    taken = _judged([trial(one, 1.0), trial(two, 1.0 - gain)], 0, [0], 1.0)
+    assert taken.gain_px == pytest.approx(0.012, rel=0.02) and taken.verdict == TAKEN
+    refused = _judged([trial(two, 1.0), trial(four, 1.0 - gain)], 0, [0], 1.0)
+    assert refused.verdict.endswith("less than the 0.014 px that it has to")
+    enough = _judged([trial(two, 1.0), trial(four, 1.0 - 0.015**2)], 0, [0], 1.0)
+    assert enough.verdict == TAKEN
+
+
+def test_a_term_is_weak_by_the_models_sigma_not_the_stated() -> None:
+    rung = Rung("brown", ("p1", "p2"))  # of k3 a sigma of 1 is believed
+    assert _weak(trial(rung, 1.0, model=0.1, stated=5.0), [0]) == ()
+    assert _weak(trial(rung, 1.0, model=0.71, stated=0.1), [0]) == ("cam0.k3",)
+    weak = _judged([trial(Rung("radial"), 1.0), trial(rung, 0.9, model=0.8)], 0, [0], 1.0)
+    assert weak.verdict == "leaves cam0.k3 undetermined"
 
 
 def test_a_stated_prior_is_kept_on_every_rung() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphs.build import GraphOptions
-from graphs.ladder import Ladder, climb
+from graphs.ladder import Ladder, Rung, climb
 from graphs.lens_doubt import lens_doubt
 from graphs.priors import weak_lens_prior
 from graphs.problem import Problem
@@ -69,6 +69,35 @@ def test_what_loses_or_moves_nothing_is_no_rival(ladder: Ladder) -> None:
     assert lens_doubt(with_gain(ladder, "brown", 0.004), wide) is None
     last = replace(with_gain(ladder, "brown", 0.004), chosen=len(ladder.rungs) - 1)
     assert lens_doubt(last, stated) is None
+
+
+def rivals(ladder: Ladder, *changes: tuple[float, int, float]) -> Ladder:
+    """In place of the rungs above the chosen one: fx, against which rung, and the gain of each."""
+    best = ladder.best
+    camera = best.estimate.cameras[0]
+    rungs = [replace(best, rung=Rung("simple_radial"))] * ladder.chosen + [best]
+    for number, (fx, against, gain_px) in enumerate(changes):
+        params = camera.params + fx * (np.arange(len(camera.params)) == 0)
+        moved = replace(best.estimate, cameras=(replace(camera, params=params),))
+        label = Rung("brown", (f"rival {number}",))
+        rungs.append(replace(best, rung=label, estimate=moved, against=against, gain_px=gain_px))
+    return replace(ladder, rungs=tuple(rungs))
+
+
+def test_of_two_rivals_the_one_that_changes_the_picture_more_is_told(ladder: Ladder) -> None:
+    own, stated = ladder.chosen, ladder.best.covariance.stated
+    little, much = (20.0, own, 0.004), (-50.0, own, 0.001)
+    for one, two, place in ((little, much, 1), (much, little, 0)):
+        doubt = lens_doubt(rivals(ladder, one, two), stated)
+        assert doubt is not None and doubt.label == f"brown without rival {place}"
+        assert doubt.moves == pytest.approx((-50.0,)) and doubt.gain_px == 0.001
+
+
+def test_who_was_compared_with_another_lens_is_no_rival(ladder: Ladder) -> None:
+    own, stated = ladder.chosen, ladder.best.covariance.stated
+    assert lens_doubt(rivals(ladder, (-20.0, own + 1, 0.004)), stated) is None
+    doubt = lens_doubt(rivals(ladder, (-10.0, own, 0.004), (-20.0, own + 1, 0.004)), stated)
+    assert doubt is not None and doubt.label == "brown without rival 0"
 
 
 def test_what_a_turn_of_the_camera_undoes_is_no_change_of_the_picture(ladder: Ladder) -> None:

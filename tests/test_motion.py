@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic.directions import GOOD
 from synthetic.problems import small_problem
 
 from graphs.frames import FloatArray, Transform, exp_rotation
@@ -32,6 +33,13 @@ def walked(positions: FloatArray, rotations: list[FloatArray]) -> Problem:
 
 def still(count: int = 6) -> list[FloatArray]:
     return [np.eye(3)] * count
+
+
+def turned_about(lever: list[float], angles: FloatArray) -> Problem:
+    """The same, of a camera that sits there in a rig which turns in its place, about its y axis."""
+    problem = walked(np.zeros((6, 3)), [exp_rotation(np.array([0.0, a, 0.0])) for a in angles])
+    placed = (Transform(np.eye(3), -np.array(lever)),)
+    return replace(problem, initial=replace(problem.initial, cam_from_rig=placed))
 
 
 @pytest.mark.parametrize(
@@ -88,6 +96,55 @@ def test_turns_have_their_axis() -> None:
         assert views.turn_share == pytest.approx(1)
         assert views.turn_deg == pytest.approx(np.degrees(0.25))
         assert views.roll_deg == pytest.approx(np.degrees(roll), abs=1e-5)
+
+
+def test_a_camera_that_sits_off_the_axis_of_turning_moves() -> None:
+    """On a circle: ahead and back where it sits at the side, sideways where it sits in front."""
+    angles = np.linspace(-0.1, 0.1, 6)
+    along, across = 0.5 * np.sin(angles).std(), 0.5 * np.cos(angles).std()
+    (beside,) = views_of(turned_about([0.5, 0.0, 0.0], angles))
+    assert beside.forward == pytest.approx(1, abs=0.01)
+    assert beside.spread == pytest.approx(np.array([across, 0, along]) / beside.distance)
+    (ahead,) = views_of(turned_about([0.0, 0.0, 0.5], angles))
+    assert ahead.forward == pytest.approx(0, abs=0.01)
+    assert ahead.spread == pytest.approx(np.array([along, 0, across]) / ahead.distance)
+    assert ahead.parallax_deg > 0.5
+    (amid,) = views_of(turned_about([0.0, 0.0, 0.0], angles))
+    assert amid.forward == 0 and amid.parallax_deg == pytest.approx(0, abs=1e-5)
+
+
+def scene_of(points: FloatArray) -> Views:
+    """What one camera's sideways walk makes of a scene."""
+    problem = walked(np.arange(6)[:, None] * [0.2, 0.0, 0.0], still())
+    (views,) = views_of(replace(problem, initial=replace(problem.initial, points=points)))
+    return views
+
+
+def test_relief_is_the_sigma_of_depths_off_a_plane() -> None:
+    across = np.random.default_rng(0).uniform(-1, 1, (30, 2))
+    near, far = (np.column_stack([across, np.full(30, z)]) for z in (4.9, 5.1))
+    views = scene_of(np.concatenate([near, far]))
+    # median length of the depths: 0.1; that of Gaussian ones is sigma / 1.4826
+    assert views.relief == pytest.approx(1.4826 * 0.1 / views.distance, rel=0.01)
+    assert views.tilt_deg == pytest.approx(0, abs=1e-3)
+
+
+def test_a_sky_does_not_hide_that_a_scene_is_flat() -> None:
+    wall = np.column_stack([np.random.default_rng(0).uniform(-1, 1, (60, 2)), np.full(60, 5.0)])
+    alone = scene_of(wall)
+    wall[::10] *= 100 + np.arange(6)[:, None] * [20, 50, 1]
+    assert alone.lacks == ("single plane seen head-on", "parallel views")
+    views = scene_of(wall)
+    assert views.lacks == alone.lacks
+    assert views.relief == pytest.approx(0, abs=1e-9) and views.tilt_deg < 1e-3
+    assert views.distance == pytest.approx(alone.distance, rel=0.02)
+
+
+def test_a_drive_with_bends_is_no_pure_forward_motion() -> None:
+    level = replace(GOOD, axes_deg=1.0)  # which looks one way
+    assert replace(level, forward=0.8).lacks == ("parallel views",)
+    assert replace(level, forward=0.98).lacks == ("pure forward motion",)
+    assert replace(GOOD, forward=0.98).lacks == ()
 
 
 def test_how_the_world_is_turned_does_not_matter() -> None:

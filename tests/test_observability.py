@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from synthetic.dense import of_others
 from synthetic.directions import DISTANCE, found, names_of, of_directions, rig
 from synthetic.problems import small_problem
 
@@ -86,6 +87,25 @@ def test_independent_directions_of_one_size_are_told_apart() -> None:
     assert {one.parameters for one in weak} == {("cam0.cx",), ("cam0.k1", "cam0.k2")}
 
 
+@pytest.mark.parametrize(("cx_px", "shared_px"), [(2.0, 0.2), (3.0, 0.5)])
+def test_directions_that_are_mixed_are_taken_apart(cx_px: float, shared_px: float) -> None:
+    """Eigenvectors of nearly equal size mix whatever has the least in common."""
+    estimate = rig(1)
+    distortion = {"cam0.k1": 0.72 * cx_px, "cam0.k2": -0.7 * cx_px, "cam0.cx": shared_px}
+    weak = found(estimate, of_directions(estimate, {"cam0.cx": cx_px}, distortion))
+    assert {one.parameters for one in weak} == {("cam0.cx",), ("cam0.k1", "cam0.k2")}
+
+
+def test_a_parameter_that_only_follows_another_is_named_with_it() -> None:
+    estimate = rig(1)
+    follows = {"cam0.cx": 2.6, "cam0.p2": 0.2}
+    (weak,) = found(estimate, of_directions(estimate, follows))
+    assert weak.parameters == ("cam0.cx", "cam0.p2")
+    assert np.abs(weak.moves_px) == pytest.approx([2.6, 0.2], rel=1e-2)
+    (weak,) = found(estimate, of_directions(estimate, follows, {"cam0.p2": 0.4}))  # mostly not
+    assert weak.parameters == ("cam0.cx",)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_every_doubtful_parameter_is_named(seed: int) -> None:
     estimate, rng = rig(3), np.random.default_rng(seed)
@@ -165,6 +185,18 @@ def test_priors_say_what_their_factors_say() -> None:
     assert in_unit[along, along] == pytest.approx(4 * ours[along, along])
 
 
+def test_the_prior_of_a_lens_that_cameras_share_counts_once() -> None:
+    problem, true = small_problem("radial", cameras=3, start_error=0)
+    graph = build(replace(problem, initial=true), GraphOptions(shared_lenses=((0, 2),)))
+    n = true.cameras[0].params.size
+    names = tuple(name for camera in true.cameras for name in lens_names(camera))
+    ours = prior_information(graph, true, names)
+    columns = np.concatenate([graph.layout.columns(lens_key(index)) for index in (0, 1)])
+    theirs = of_others(graph, graph.initial)[np.ix_(columns, columns)]
+    variable = np.vstack([np.eye(2 * n), np.eye(n, 2 * n)])  # that each name is, cam2's: cam0's
+    np.testing.assert_allclose(variable.T @ ours @ variable, theirs, rtol=1e-6)
+
+
 def _add(
     information: FloatArray, names: tuple[str, ...], labels: tuple[str, ...], block: FloatArray
 ) -> None:
@@ -242,6 +274,18 @@ def test_rays_that_point_anywhere_are_not_usable() -> None:
         reasons = unusable(estimate, stated, (DISTANCE,) * 2)
         assert len(reasons) == count  # half of it each, once the rig turned as suits both
         assert all("rays of" in reason for reason in reasons)
+
+
+def test_rays_of_each_camera_are_its_own() -> None:
+    """One lens bends the edges of its image by 20 px, which no turn of the rig undoes."""
+    estimate = rig(2)
+    stated = of_directions(estimate, {"cam1.k1": 20.0})
+    good, bad = ray_sigmas_deg(estimate, stated, (DISTANCE,) * 2)
+    expected = np.degrees(20.0 / np.mean(estimate.cameras[1].params[:2]))
+    assert bad == pytest.approx(expected, rel=0.05)
+    assert good < 0.05 * bad
+    (reason,) = unusable(estimate, stated, (DISTANCE,) * 2)
+    assert reason.startswith("rays of cam1 ")
 
 
 # ---- scans ---------------------------------------------------------------------------------

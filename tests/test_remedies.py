@@ -7,10 +7,10 @@ import pytest
 from synthetic.directions import DISTANCE, GOOD, found, names_of, of_directions, rig
 
 from graphs.covariance import Covariance
-from graphs.frames import Transform
+from graphs.frames import FloatArray, Transform
 from graphs.image_grid import image_grid
 from graphs.observability import own_px
-from graphs.remedies import Kind
+from graphs.remedies import Kind, Move, classify
 
 
 @pytest.mark.parametrize(
@@ -53,6 +53,41 @@ def test_the_rigs_own_size_is_its_scale() -> None:
     assert weak.kind == "translation in the rig"  # cam2 stays where it is
 
 
+def test_what_is_not_the_size_alone_is_no_scale() -> None:
+    """A camera that moves away, with its principal point; and one that goes askew."""
+    estimate = rig(2)
+    t = estimate.cam_from_rig[1].translation
+    across = np.cross(t, [1.0, 2.0, 3.0])
+    askew = t + across * np.linalg.norm(t) / np.linalg.norm(across)
+    names = ("cam1.translation_x", "cam1.translation_y", "cam1.translation_z", "cam0.cx")
+
+    def kind_of(moved: FloatArray, cx_px: float) -> Kind:
+        px = np.append(9 * moved / np.linalg.norm(moved), cx_px)
+        move = Move(names, px, np.append(0.1 * moved, cx_px), 1.0, 1.0)
+        return classify(estimate, move, (GOOD, GOOD))
+
+    assert kind_of(t, 0.0) == kind_of(t, 2.0) == "scale"
+    assert kind_of(t, 5.0) == "translation in the rig"
+    assert kind_of(askew, 0.0) == "translation in the rig"
+
+
+def test_focal_lengths_are_compared_as_shares_of_themselves() -> None:
+    """Pixels that are five times as high as wide: 1 % is 10 px of fx and 2 px of fy."""
+    estimate = rig(1)
+    camera = estimate.cameras[0]
+    params = np.append([1000.0, 200.0], camera.params[2:])
+    estimate = replace(estimate, cameras=(replace(camera, params=params),))
+    px = np.array([3.0, 2.0])
+    for own, kind in (
+        ([10.0, 2.0], "focal length against depth"),
+        ([10.0, -1.0], "focal length across"),
+        ([10.0, 10.0], "focal length down"),
+        ([50.0, 2.0], "focal length across"),
+    ):
+        move = Move(("cam0.fx", "cam0.fy"), px, np.array(own), 0.1, 3.0)
+        assert classify(estimate, move, ()) == kind
+
+
 def test_a_translation_along_the_motion_and_along_the_axis_of_turning() -> None:
     estimate = rig(2)
     stated = of_directions(estimate, {"cam1.translation_x": 2.0})
@@ -87,6 +122,32 @@ def test_remedies_follow_what_the_views_lack() -> None:
     bulge = of_directions(estimate, {"cam0.k1": 2.0})
     assert found(estimate, bulge, flat)[0].kind == "doming"
     assert found(estimate, bulge, GOOD)[0].kind == "distortion"
+
+
+def test_views_on_their_side_need_no_other_height() -> None:
+    """Turned about the optical axis, across the image is down it."""
+    estimate = rig(1)
+    for parameter, spread, words in (
+        ("fy", (0.5, 0.006, 0.1), "all views stand at one height"),
+        ("fx", (0.006, 0.5, 0.1), "no view stands to the side"),
+    ):
+        stated = of_directions(estimate, {f"cam0.{parameter}": 2.0})
+        for roll_deg, level in ((2.0, True), (20.0, False)):
+            views = replace(GOOD, spread=spread, roll_deg=roll_deg)
+            (weak,) = found(estimate, stated, views)
+            assert weak.remedy.startswith(words) == level
+            assert weak.remedy.startswith("bring near and far things") != level
+
+
+def test_a_principal_point_wants_the_turns_that_are_not_there() -> None:
+    estimate = rig(1)
+    centre = of_directions(estimate, {"cam0.cx": 2.0})
+    for views, words in (
+        (replace(GOOD, roll_deg=2.0), "turn the rig about its optical axis"),
+        (replace(GOOD, roll_deg=20.0), "take more views, turned differently"),
+        (None, "take more views, turned differently"),
+    ):
+        assert found(estimate, centre, views)[0].remedy.startswith(words)
 
 
 def test_distortion_terms_that_cancel_need_no_remedy() -> None:

@@ -38,6 +38,11 @@ def test_the_weight_is_that_of_the_paper() -> None:
     weight = (0 * 10 + 16) / ((9 + 1 - 1) * (10 - 16 / 2))
     expected = (1 - weight) * np.diag([1.0, 3.0]) + weight * 2 * np.eye(2)
     np.testing.assert_allclose(shrunk(np.diag([1.0, 3.0]), 9), expected)
+    # n = 3, nine samples, eigenvalues 1, 2 and 6: one third of tr S^2 counts too
+    weight = (1 / 3 * 41 + 81) / ((9 + 1 - 2 / 3) * (41 - 81 / 3))
+    assert 0.7 < weight < 0.75
+    expected = (1 - weight) * np.diag([1.0, 2, 6]) + weight * 3 * np.eye(3)
+    np.testing.assert_allclose(shrunk(np.diag([1.0, 2, 6]), 9), expected)
 
 
 def test_it_is_nearer_to_the_truth_than_the_scatter() -> None:

@@ -11,10 +11,11 @@ from graphs.build import GraphOptions, build
 from graphs.covariance import Covariance
 from graphs.jackknife import blocks_of
 from graphs.model_covariance import model_covariance
-from graphs.problem import Problem
+from graphs.priors import PINNED_SIGMA, LensPrior
+from graphs.problem import KnownBaseline, Problem
 from graphs.solve import solve
-from graphs.split_check import SplitCheck, _widening, split_check
-from graphs.stated_covariance import CalibrationCovariance
+from graphs.split_check import TOO_LITTLE_PX, SplitCheck, _widening, split_check
+from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5
@@ -61,10 +62,17 @@ def test_a_focal_length_that_changes_is_told() -> None:
     changed = replace(problem, observations=replace(seen, pixels=moved))
     check = checked(changed)
     assert check is not None and not check.agrees
-    wide = checked(changed, stretch=30.0)
+    wide = checked(changed, stretch=12.0)
     assert wide is not None and wide.agrees  # sigmas that allow for it
-    assert wide.expected_px == pytest.approx(30 * check.expected_px, rel=1e-6)
+    assert wide.expected_px == pytest.approx(12 * check.expected_px, rel=1e-6)
     assert wide.difference_px == check.difference_px
+
+
+def test_halves_that_may_lie_anywhere_are_not_compared() -> None:
+    problem = problem_of(baseline_sigma_m=0.0)
+    near = checked(problem)
+    assert near is not None
+    assert checked(problem, stretch=1.1 * TOO_LITTLE_PX / near.expected_px) is None
 
 
 def test_halves_that_determine_nothing_are_not_compared() -> None:
@@ -82,3 +90,25 @@ def test_the_widening_turns_the_model_into_what_is_stated() -> None:
     S = M + scale @ more @ more.T @ scale
     T = _widening(M, S)
     np.testing.assert_allclose(T @ M @ T.T, S, rtol=1e-6, atol=1e-12)
+
+
+def test_what_both_halves_believe_moves_them_together() -> None:
+    """A loose tape measure makes neither half surer nor their difference larger."""
+    expected = []
+    for sigma_m in (0.0005, 0.05):
+        start = problem_of(baseline_sigma_m=0.0)
+        check = checked(replace(start, scale=KnownBaseline((0, 1), 0.2, sigma_m)))
+        assert check is not None
+        expected.append(check.expected_px)
+    assert expected[1] == pytest.approx(expected[0], rel=0.1)
+
+
+def test_where_everything_is_held_there_is_nothing_to_compare() -> None:
+    problem, true = simulate_tracks(
+        TRACKS.model_copy(update={"rig": "mono"}), np.random.default_rng(0)
+    )
+    held = tuple(LensPrior(c.params, np.full(c.params.size, PINNED_SIGMA)) for c in true.cameras)
+    graph = build(problem, GraphOptions(SIGMA_PX, lens_priors=held))
+    estimate, values, _ = solve(graph)
+    covariance = calibration_covariance(graph, estimate, values, 1.0)
+    assert split_check(graph, estimate, covariance, 1.0) is None

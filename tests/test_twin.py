@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graphs.build import GraphOptions
+from graphs.priors import PINNED_SIGMA, LensPrior
 from graphs.problem import KnownBaseline, residuals_px
 from graphs.refine import Refinement, refine
 from graphs.twin import Certificate, certify, twin_problem, worst
@@ -68,7 +69,7 @@ def test_a_measured_distance_errs_anew(refinement: Refinement) -> None:
 
 def test_a_good_scan_is_certified_and_the_same_every_time(refinement: Refinement) -> None:
     told: list[tuple[int, int]] = []
-    first = certify(refinement, 4, 0, 1.0, lambda *done: told.append(done))
+    first = certify(refinement, 4, 0, 1.0, on_trial=lambda *done: told.append(done))
     assert told[-1] == (4, 4)
     mean, error = first.mean_nees
     assert 0.5 < mean < 1.8 and 0 < error < 0.5
@@ -88,9 +89,42 @@ def test_coverage_is_the_share_within_the_interval() -> None:
 def test_a_twin_that_cannot_be_solved_is_said_so(
     refinement: Refinement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*arguments: object) -> None:
+    def refused(*arguments: object, **options: object) -> None:
         raise ValueError("too little")
 
     monkeypatch.setattr("graphs.twin.refine", refused)
     with pytest.raises(ValueError, match="only 0 of 3 simulated twins"):
         certify(refinement, 3, 0, 1.0)
+
+
+def test_a_rig_without_scale_is_judged_in_its_own_unit() -> None:
+    tracks = TRACKS.model_copy(update={"baseline_sigma_m": 0.0})
+    problem, _ = simulate_tracks(tracks, np.random.default_rng(3))
+    scaled = replace(problem, initial=problem.initial.scaled(7.0))
+    found = certify(refine(scaled, GraphOptions(), 1.0), 4, 0, 1.0)
+    assert 0.4 < found.mean_nees[0] < 2
+
+
+def test_nothing_can_be_certified_where_everything_is_held() -> None:
+    problem, true = simulate_tracks(
+        TRACKS.model_copy(update={"rig": "mono"}), np.random.default_rng(0)
+    )
+    held = tuple(LensPrior(c.params, np.full(c.params.size, PINNED_SIGMA)) for c in true.cameras)
+    with pytest.raises(ValueError, match="every parameter is held"):
+        certify(refine(problem, GraphOptions(lens_priors=held), 1.0), 3, 0, 1.0)
+
+
+def test_an_adaptive_loss_adapts_to_the_twin_too(
+    refinement: Refinement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def noted(*arguments: object, adaptive: bool) -> None:
+        asked.append(adaptive)
+        raise ValueError
+
+    monkeypatch.setattr("graphs.twin.refine", noted)
+    for adaptive in (True, False):
+        with pytest.raises(ValueError, match="twins"):
+            certify(refinement, 2, 0, 1.0, adaptive=adaptive)
+    assert asked == [True, True, False, False]

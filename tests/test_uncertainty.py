@@ -19,6 +19,7 @@ from graphs.uncertainty import (
     FIT_RADIUS,
     SHAPE,
     Fit,
+    ProjectionMap,
     RelativeTo,
     curve_ranges,
     depth_sigma,
@@ -63,6 +64,32 @@ def test_a_focal_length_by_hand() -> None:
     assert found.centre_px == pytest.approx(0, abs=1e-9)
     assert found.corner_px == pytest.approx(3.0 * np.hypot(319.5, 239.5) / FOCAL_PX)
     assert found.rms_px == pytest.approx(np.sqrt((found.sigma_px**2).mean()))
+
+
+@pytest.mark.parametrize(
+    ("cov", "sigma"),
+    [
+        ([[1.0, 0.0], [0.0, 1.0]], 1.0),
+        ([[1.0, 0.0], [0.0, 9.0]], 3.0),
+        ([[2.0, -1.0], [-1.0, 2.0]], 3**0.5),
+        ([[4.0, 4.0], [4.0, 4.0]], 8**0.5),
+    ],
+)
+def test_sigma_is_that_of_the_worst_direction(cov: list[list[float]], sigma: float) -> None:
+    whole = np.broadcast_to(np.array(cov), (3, 5, 2, 2))
+    found = ProjectionMap(0, np.inf, np.arange(5.0), np.arange(3.0), whole)
+    np.testing.assert_allclose(found.sigma_px, np.full((3, 5), sigma))
+    assert found.centre_px == found.corner_px == found.rms_px == pytest.approx(sigma)
+
+
+def test_a_turn_is_fitted_within_a_sixth_of_the_height_about_the_centre() -> None:
+    """To 1 px of cx: in units of the focal length, over a disc of radius r, what is left of it in
+    the middle is r^2 / 4 + O(r^4)."""
+    covariance = Covariance(("left.cx",), np.array([[1.0]]))
+    (aimed,) = projection_maps(alone(camera("left")), covariance, fit="centre", shape=(129, 97))
+    r2 = (480 / 6 / FOCAL_PX) ** 2
+    turn = (1 + r2 / 4) / (1 + r2 / 2 + r2**2 / 6)  # E[1 + x^2] / E[(1 + x^2)^2 + x^2 y^2]
+    assert aimed.centre_px == pytest.approx(1 - turn, rel=0.05)
 
 
 def test_a_principal_point_passes_for_a_turned_camera() -> None:
@@ -267,6 +294,20 @@ def test_the_middle_of_what_two_cameras_see(turn: float, at_ends: list[bool]) ->
     found = depth_sigma(estimate, covariance_of(estimate, 1e-3), (0, 1), ranges, 1e-2)
     np.testing.assert_array_equal(found.determined, in_view)
     assert found.determined_to is None
+
+
+def test_how_the_rigs_axes_lie_does_not_matter_to_what_two_cameras_see() -> None:
+    estimate = stereo(0.3)
+    rig_from_other = Transform.exp(np.array([0.3, -1.2, 0.8]), np.array([2.0, -1.0, 0.5]))
+    turned = tuple(t @ rig_from_other for t in estimate.cam_from_rig)
+    other = replace(estimate, cam_from_rig=turned)
+    ranges = curve_ranges(estimate, (0, 1))
+    for pair in ((0, 1), (1, 0)):
+        points, in_view = middle_of_view(estimate, pair, ranges)
+        again, still_in_view = middle_of_view(other, pair, ranges)
+        np.testing.assert_array_equal(still_in_view, in_view)
+        assert 5 < in_view.sum() < len(ranges)
+        np.testing.assert_allclose((rig_from_other @ again)[in_view], points[in_view], atol=1e-8)
 
 
 # ---- as the file tells them ----------------------------------------------------------------
