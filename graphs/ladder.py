@@ -27,11 +27,11 @@ from graphs.stated_covariance import CalibrationCovariance, calibration_covarian
 
 # A gain is to be beyond chance: one-sided, with the frames as the sample. Of 231 simulated scans of
 # 25 frames (one or two cameras, six lenses) 4 were given more than they had at 5 %, 3 at 1 %, 7 at
-# 16 %; 47, 62 and 31 less, most of them of one camera, where p1, p2 = 6e-4 stay in the noise. Real
-# frames err together: of six neighbouring views of the fountain p1 and p2 remove 0.015 px, at 1.3 %,
-# and move the principal point by 8 px; on the corridor they are beyond 0.1 %. With 5 % the
-# principal point of two cameras is then 0.84 px off, 0.92 px with radtan throughout and 5.4 px with
-# radial; of one camera 1.5, 1.3 and 3.1 px.
+# 16 %; 47, 62 and 31 less, most of them of one camera, where p1, p2 = 6e-4 stay in the noise. With
+# 5 % the principal point of two cameras is then 0.84 px off, 0.92 px with radtan throughout and 5.4
+# px with radial; of one camera 1.5, 1.3 and 3.1 px. Real frames err together: of six neighbouring
+# views of the fountain p1 and p2 remove 0.015 px, by chance at 1.3 %, and move the principal point
+# by 8 px; on the corridor they are beyond 0.1 %.
 SIGNIFICANCE = 0.01
 # And beyond what features err in common, in held-out frames as in all others, which no number of
 # frames exposes: so much for each coefficient, as root of the sum of squares. The fountain's
