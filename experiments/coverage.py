@@ -30,7 +30,8 @@ from rich.table import Table
 from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.camera import Camera
 from graphs.clusters import homogeneous
-from graphs.frames import FloatArray, log_rotation
+from graphs.frames import FloatArray
+from graphs.jackknife import change
 from graphs.losses import SCALE_95
 from graphs.model_covariance import calibration_columns
 from graphs.priors import LensPrior, weak_lens_prior
@@ -132,7 +133,7 @@ def trial(case: Case, seed: int) -> Trial | Refusal:
     except ValueError as refused:
         return Refusal(str(refused))
     seconds = time.perf_counter() - began
-    error = errors(names, refinement.estimate, truth)
+    error = change(truth, refinement.estimate, names)
     efficient = least_squares(problem, truth, priors) if case.noise == "gaussian" else None
     return Trial(names, error, of_stated, of_model, efficient, refinement.sigma_px, seconds)
 
@@ -157,30 +158,12 @@ def measured_prior(camera: Camera, rng: np.random.Generator) -> LensPrior:
     return replace(prior, mean=mean)
 
 
-def errors(names: Sequence[str], estimate: Estimate, truth: Estimate) -> FloatArray:
-    """Estimate minus truth (n,) of parameters `camera.name`, as the covariance reports them.
-
-    Rotations in radians about the camera's axes, translations as cam_from_rig's vector.
-    """
-    found: dict[str, float] = {}
-    for index, (ours, true) in enumerate(zip(estimate.cameras, truth.cameras, strict=True)):
-        off = (ours.params - true.params).tolist()
-        found |= {f"{true.name}.{p}": e for p, e in zip(true.names, off, strict=True)}
-        placed, expected = estimate.cam_from_rig[index], truth.cam_from_rig[index]
-        turn = log_rotation(placed.rotation @ expected.rotation.T)
-        move = placed.translation - expected.translation
-        for axis, letter in enumerate("xyz"):
-            found[f"{true.name}.rotation_{letter}"] = float(turn[axis])
-            found[f"{true.name}.translation_{letter}"] = float(move[axis])
-    return np.array([found[name] for name in names])
-
-
 def least_squares(problem: Problem, truth: Estimate, priors: tuple[LensPrior, ...]) -> Efficient:
     """The efficient estimate of a problem with Gaussian noise of SIGMA_PX, and its bound."""
     options = GraphOptions(SIGMA_PX, "none", lens_priors=priors)
     graph = build(replace(problem, initial=truth), options)
     names = calibration_columns(graph, truth)[1]
-    return Efficient(errors(names, solve(graph)[0], truth), inverse_information(graph))
+    return Efficient(change(truth, solve(graph)[0], names), inverse_information(graph))
 
 
 def inverse_information(graph: CalibrationGraph) -> FloatArray:

@@ -197,6 +197,14 @@ def _newton_step(by_point: FloatArray, error: FloatArray) -> FloatArray:
     return -(weight_a[:, None] * j_a + weight_b[:, None] * j_b)
 
 
+def image_pixels(
+    size: tuple[int, int], shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A grid over an image from corner to corner: x (across,), y (down,), pixels (n, 2) by rows."""
+    across, down = (np.linspace(0, n - 1, count) for n, count in zip(size, shape, strict=True))
+    return across, down, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+
+
 FIT_GRID = (24, 18)  # pixels across and down the image
 
 
@@ -209,10 +217,7 @@ def fit_lens(
     coefficients that may leave their nominal values; all, where it is not given. A ray that the
     new lens cannot see counts as the image's diagonal. Infinity where the camera sees no ray.
     """
-    across, down = (
-        np.linspace(0, n - 1, count) for n, count in zip(camera.size, FIT_GRID, strict=True)
-    )
-    wanted = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    wanted = image_pixels(camera.size, FIT_GRID)[2]
     rays = unproject(camera, wanted)
     wanted, rays = wanted[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
     free = LENSES[lens].coefficients if free is None else free

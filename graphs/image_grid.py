@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from graphs.camera import unproject
+from graphs.camera import image_pixels, unproject
 from graphs.frames import FloatArray
 from graphs.problem import Estimate, IntArray, Observations, points_in_cameras
 from graphs.propagation import projection
@@ -33,10 +34,22 @@ class ImageGrid:
     @property
     def settled(self) -> FloatArray:
         """`by_calibration` (n, 2, len(names)) once the rig turned to undo what it can."""
-        turn = self.by_rotation.reshape(-1, 3)
-        moved = self.by_calibration.reshape(len(turn), -1)
-        left = moved - turn @ np.linalg.lstsq(turn, moved)[0]
-        return left.reshape(self.by_calibration.shape)
+        return without_rotation(self.by_rotation, self.by_calibration)
+
+
+def without_rotation(
+    by_rotation: FloatArray, moved: FloatArray, fit: NDArray[np.bool_] | slice = slice(None)
+) -> FloatArray:
+    """What is left of moves (n, 2, k) of pixels once the rotation is undone that fits each best.
+
+    by_rotation (n, 2, 3): derivatives by it. fit (n,): the pixels by which it is judged; all, where
+    not given.
+    """
+    turn = by_rotation[fit].reshape(-1, 3)
+    left: FloatArray = (
+        moved - by_rotation @ np.linalg.lstsq(turn, moved[fit].reshape(len(turn), -1))[0]
+    )
+    return left
 
 
 def image_grid(
@@ -56,8 +69,7 @@ def image_grid(
     owner, pixels, moved, turned = [], [], [], []
     for index in range(len(estimate.cameras)) if cameras is None else cameras:
         camera, cam_from_rig = estimate.cameras[index], estimate.cam_from_rig[index]
-        across, down = (np.linspace(0, n - 1, k) for n, k in zip(camera.size, shape, strict=True))
-        grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        grid = image_pixels(camera.size, shape)[2]
         rays = unproject(camera, grid)
         seen = np.isfinite(rays[:, 0])
         far = FAR * max(float(np.linalg.norm(cam_from_rig.translation)), 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 from graphs.camera import Camera, project, unproject
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
-from graphs.image_grid import image_grid
+from graphs.image_grid import image_grid, without_rotation
 from graphs.jackknife import change
 from graphs.ladder import Ladder, RungResult
 from graphs.problem import Estimate
@@ -82,10 +82,8 @@ def _apart(a: Camera, b: Camera) -> FloatArray:
     """Lengths (n,) in px by which two cameras project the same rays apart, one turned as suits."""
     alone = Estimate((a,), (Transform.identity(),), (), np.zeros((0, 3)))
     grid = image_grid(alone, (), [np.inf])
-    apart = (project(b, unproject(a, grid.pixels)) - grid.pixels).reshape(-1)
-    seen = np.isfinite(apart)
-    turn = grid.by_rotation.reshape(-1, 3)[seen]
-    left = np.full(len(apart), np.nan)
-    left[seen] = apart[seen] - turn @ np.linalg.lstsq(turn, apart[seen])[0]
-    lengths: FloatArray = np.linalg.norm(left.reshape(-1, 2), axis=1)
-    return lengths[np.isfinite(lengths)]
+    apart = project(b, unproject(a, grid.pixels)) - grid.pixels
+    seen = np.isfinite(apart[:, 0])
+    left = without_rotation(grid.by_rotation[seen], apart[seen, :, None])
+    lengths: FloatArray = np.linalg.norm(left[..., 0], axis=1)
+    return lengths

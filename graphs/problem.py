@@ -38,6 +38,11 @@ class Observations:
         )
 
 
+def images_seen(observations: Observations) -> IntArray:
+    """Camera and frame (n_images, 2) of every image that has observations."""
+    return np.unique(np.stack([observations.camera, observations.frame], axis=1), axis=0)
+
+
 def joined(parts: Sequence[Observations]) -> Observations:
     """All observations of several sets, one set after the other."""
 

@@ -100,12 +100,11 @@ def calibration_covariance(
     frames = _of_frames(shared)
     others = _of_tracks(shared) + _of_cells(shared)
     robust = _widened(model, root, frames + others)
-    if min_parallax_deg is None:
-        return CalibrationCovariance(robust, robust, None, model)
-    jackknife = delete_group_jackknife(graph, estimate, model, min_parallax_deg, on_block)
-    if jackknife is None:
-        return CalibrationCovariance(robust, robust, None, model)
-    stated = _widened(model, root, _of_blocks(jackknife, whiten) + others)
+    stated, jackknife = robust, None
+    if min_parallax_deg is not None:
+        jackknife = delete_group_jackknife(graph, estimate, model, min_parallax_deg, on_block)
+    if jackknife is not None:
+        stated = _widened(model, root, _of_blocks(jackknife, whiten) + others)
     return CalibrationCovariance(stated, robust, jackknife, model)
 
 

@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graphs.camera import Camera, project, unproject
+from graphs.camera import Camera, image_pixels, project, unproject
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray
-from graphs.image_grid import ImageGrid, image_grid
+from graphs.image_grid import ImageGrid, image_grid, without_rotation
 from graphs.problem import Estimate
 from graphs.propagation import cross_covariance, lens_names
 from graphs.triangulation import triangulated_covariance
@@ -118,7 +118,7 @@ def _maps(
     maps = []
     for index in range(len(estimate.cameras)) if cameras is None else cameras:
         rows = grid.camera == index
-        across, down = _axes(estimate.cameras[index], shape)
+        across, down, _ = image_pixels(estimate.cameras[index].size, shape)
         column = np.abs(grid.pixels[rows, :1] - across).argmin(1)
         row = np.abs(grid.pixels[rows, 1:] - down).argmin(1)
         whole = np.full((len(down), len(across), 2, 2), np.nan)
@@ -127,19 +127,12 @@ def _maps(
     return tuple(maps)
 
 
-def _axes(camera: Camera, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    width, height = camera.size
-    return np.linspace(0, width - 1, shape[0]), np.linspace(0, height - 1, shape[1])
-
-
 def _settled_at_centre(grid: ImageGrid, estimate: Estimate) -> FloatArray:
     """As `grid.settled`, the rotation fitted to the pixels near the centre of each image."""
     centre = np.array([camera.centre for camera in estimate.cameras])[grid.camera]
     radius = FIT_RADIUS * np.array([min(camera.size) for camera in estimate.cameras])[grid.camera]
     near = np.linalg.norm(grid.pixels - centre, axis=1) <= radius
-    turn = grid.by_rotation[near].reshape(-1, 3)
-    moved = grid.by_calibration[near].reshape(len(turn), -1)
-    return grid.by_calibration - grid.by_rotation @ np.linalg.lstsq(turn, moved)[0]
+    return without_rotation(grid.by_rotation, grid.by_calibration, near)
 
 
 # ---- over range ----------------------------------------------------------------------------
@@ -246,7 +239,7 @@ def middle_of_view(
     """
     first, second = (estimate.cameras[camera] for camera in pair)
     first_from_rig, second_from_rig = (estimate.cam_from_rig[camera] for camera in pair)
-    pixels = np.stack(np.meshgrid(*_axes(first, SHAPE)), axis=-1).reshape(-1, 2)
+    pixels = image_pixels(first.size, SHAPE)[2]
     rays = unproject(first, pixels)
     rays = rays[np.isfinite(rays[:, 0])] @ first_from_rig.rotation
     centre = first_from_rig.inverse.translation

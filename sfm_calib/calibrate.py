@@ -8,13 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from graphs.build import GraphOptions
 from graphs.ladder import Ladder, climb, on_rung_of
 from graphs.losses import SCALE_95, LossName
 from graphs.motion import too_little_motion
-from graphs.problem import Problem
+from graphs.problem import Problem, images_seen
 from graphs.refine import Refinement, refine
 from graphs.selection import NoParallaxError
 from graphs.split_check import SplitCheck, split_check
@@ -130,8 +128,9 @@ def solve_problem(
     problem: Problem, config: RigConfig, progress: Progress, ladder: Ladder | None = None
 ) -> Refinement:
     """The graph's optimum under the configuration's priors, with the lens that a ladder chose."""
-    options = options_of(problem, config)
-    if ladder is not None:
+    if ladder is None:
+        options = options_of(problem, config)
+    else:
         problem, options = on_rung_of(
             problem,
             ladder.best.rung,
@@ -155,8 +154,7 @@ def enough_placed(problem: Problem, n_images: int) -> Iterator[None]:
     try:
         yield
     except CalibrationError as error:
-        seen = problem.observations
-        placed = len(np.unique(seen.frame * len(problem.initial.cameras) + seen.camera))
+        placed = len(images_seen(problem.observations))
         if placed >= FEW_PLACED * n_images:
             raise
         raise CalibrationError(
@@ -166,13 +164,13 @@ def enough_placed(problem: Problem, n_images: int) -> Iterator[None]:
 
 
 @contextmanager
-def _refusals(problem: Problem) -> Iterator[None]:
-    """What the maths refuses, in one line; a scan without motion is called by its name."""
+def _refusals(problem: Problem | None = None) -> Iterator[None]:
+    """What the maths refuses, in one line; of a `problem` without motion, by its name."""
     try:
         yield
     except ValueError as error:
         why = None
-        if len(problem.frame_names) >= FRAMES_TO_JUDGE:
+        if problem is not None and len(problem.frame_names) >= FRAMES_TO_JUDGE:
             no_parallax = isinstance(error, NoParallaxError)
             why = too_little_motion(problem, parallax_found=not no_parallax)
         raise CalibrationError(why or str(error)) from error
@@ -185,14 +183,12 @@ def covariance_of(
     graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
     parallax = config.min_parallax_deg
     progress("covariance", 0, 0)
-    try:
+    with _refusals():
         covariance = calibration_covariance(
             graph, estimate, values, parallax,
             on_block=lambda done, total: progress("leaving out frames", done, total),
         )  # fmt: skip
         return covariance, split_check(graph, estimate, covariance, parallax)
-    except ValueError as error:
-        raise CalibrationError(str(error)) from error
 
 
 def certificate_of(
@@ -201,11 +197,9 @@ def certificate_of(
     """How the stated sigmas do on simulated twins of the scan, where that is asked for."""
     if config.certify == 0:
         return None
-    try:
+    with _refusals():
         return certify(
             refinement, config.certify, config.seed, config.min_parallax_deg,
             adaptive=config.loss == "adaptive",
             on_trial=lambda done, total: progress("certifying", done, total),
         )  # fmt: skip
-    except ValueError as error:
-        raise CalibrationError(str(error)) from error

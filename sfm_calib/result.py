@@ -16,6 +16,7 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 
 FORMAT: Final = "sfm_calib/1"
+OF_LENS: Final = "choice of the lens"  # the kind of what is no direction: of another lens
 PRIOR_DECIDES_SHARE = 0.5  # of what is known of a parameter: more is belief rather than data
 
 

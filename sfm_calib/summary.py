@@ -16,7 +16,7 @@ from graphs.covariance import Covariance
 from graphs.frames import Transform
 from graphs.ladder import Ladder, RungResult
 from graphs.observability import observe
-from graphs.problem import residuals_px
+from graphs.problem import images_seen, residuals_px
 from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
@@ -213,7 +213,7 @@ def _solve(run: Run) -> result.Solve:
         iterations=refinement.iterations,
         rms_px=float(np.sqrt(np.nanmean((residuals**2).sum(1)))),
         n_frames=len(refinement.problem.frame_names),
-        n_images=len(np.unique(seen.frame * len(run.scan.cameras) + seen.camera)),
+        n_images=len(images_seen(seen)),
         n_points=len(refinement.estimate.points),
         n_observations=len(seen),
         n_rejected=refinement.n_rejected,

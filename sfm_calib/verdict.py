@@ -9,7 +9,7 @@ import numpy as np
 
 from graphs.lens_doubt import lens_doubt
 from graphs.observability import WeakDirection, observe
-from graphs.problem import KnownSpan, Problem
+from graphs.problem import KnownSpan, Problem, images_seen
 from graphs.remedies import listed_parameters
 from graphs.twin import Certificate, worst
 from sfm_calib import nominal, result
@@ -113,7 +113,7 @@ def _of_lens(run: Run) -> Iterator[result.WeakDirection]:
         effect_px=doubt.corner_px,
         remedy="let things of the scene pass through the corners of the image, or say which lens "
         "it is (lens)",
-        kind="choice of the lens",
+        kind=result.OF_LENS,
         parameters=doubt.parameters,
         moves=doubt.moves,
     )
@@ -164,9 +164,10 @@ def _doubts(run: Run) -> list[str]:
 
 def _images_of(problem: Problem) -> set[str]:
     """The images that a problem has observations of, as `camera/frame`."""
-    seen, cameras = problem.observations, problem.initial.cameras
-    places = np.unique(np.stack([seen.camera, seen.frame]), axis=1)
-    return {f"{cameras[c].name}/{problem.frame_names[f]}" for c, f in places.T}
+    cameras = problem.initial.cameras
+    return {
+        f"{cameras[c].name}/{problem.frame_names[f]}" for c, f in images_seen(problem.observations)
+    }
 
 
 def _contradictions(run: Run) -> list[str]:

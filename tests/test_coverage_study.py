@@ -22,7 +22,6 @@ from experiments.coverage import (
     Refusal,
     Summary,
     Trial,
-    errors,
     inverse_information,
     main,
     measured_prior,
@@ -33,6 +32,7 @@ from experiments.coverage import (
 )
 from graphs.build import GraphOptions, build
 from graphs.frames import FloatArray, Transform
+from graphs.jackknife import change
 from graphs.model_covariance import model_covariance
 from graphs.priors import weak_lens_prior
 from graphs.solve import solve
@@ -125,8 +125,8 @@ def test_errors_are_those_that_the_covariance_reports() -> None:
     )
     axes = [f"cam1.{kind}_{axis}" for kind in ("rotation", "translation") for axis in "xyz"]
     names = ["cam0.fx", "cam0.cy", "cam1.fx", *axes]
-    np.testing.assert_allclose(errors(names, wrong, true), [1, -2, 0, *turn, *move], atol=1e-9)
-    np.testing.assert_allclose(errors(names, true, true), 0, atol=1e-9)
+    np.testing.assert_allclose(change(true, wrong, names), [1, -2, 0, *turn, *move], atol=1e-9)
+    np.testing.assert_allclose(change(true, true, names), 0, atol=1e-9)
 
 
 def test_priors_are_drawn_by_their_own_sigmas() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic.shared_errors import sheared
 
 from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.frames import FloatArray, Transform, exp_rotation
@@ -119,17 +120,8 @@ def test_independent_noise_moves_as_the_model_expects() -> None:
     assert 0.75 < np.mean(ratio) < 1.2
 
 
-def sheared(problem: Problem, sigma: float) -> Problem:
-    """Every second frame's images sheared by its own little: an error that a frame shares."""
-    shear = sigma * np.random.default_rng(0).standard_normal((len(problem.frame_names), 2, 2))
-    seen = problem.observations
-    centres = np.array([camera.centre for camera in problem.initial.cameras])[seen.camera]
-    moved = np.einsum("nij,nj->ni", shear[seen.frame], seen.pixels - centres)
-    return replace(problem, observations=replace(seen, pixels=seen.pixels + moved))
-
-
 def test_what_frames_err_together_moves_more() -> None:
-    found, _ = jackknifed(sheared(problem_of(), 0.006))
+    found, _ = jackknifed(sheared(problem_of(), 0.006, 0))
     plain, _ = jackknifed(problem_of())
 
     def beyond(jackknife: Jackknife) -> FloatArray:

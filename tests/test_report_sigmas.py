@@ -16,8 +16,9 @@ from sfm_calib.report.page import render
 from sfm_calib.report.residuals import residuals_by_camera, summary
 from sfm_calib.report.rows import baseline_sigma, camera_tables, rig_tables
 from sfm_calib.report.sigmas import ratio_figure, sigma_section
-from sfm_calib.report.weak import OF_LENS, marks_of, weak_cards
+from sfm_calib.report.weak import marks_of, weak_cards
 from sfm_calib.result import (
+    OF_LENS,
     Calibration,
     Certificate,
     LensChoice,

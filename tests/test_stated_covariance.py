@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic.shared_errors import drifting
 
 from graphs.build import GraphOptions, build
 from graphs.clusters import homogeneous
@@ -118,19 +119,10 @@ def test_factors_are_a_root_and_its_inverse() -> None:
 # ---- scans ---------------------------------------------------------------------------------
 
 
-def drifting(problem: Problem, sigma_px: float) -> Problem:
-    """Every track pulled off its corner bit by bit, each its own way."""
-    seen = problem.observations
-    pull = sigma_px * np.random.default_rng(0).standard_normal((len(problem.initial.points), 2))
-    middle = (len(problem.frame_names) - 1) / 2
-    moved = pull[seen.point] * (seen.frame / middle - 1)[:, None]
-    return replace(problem, observations=replace(seen, pixels=seen.pixels + moved))
-
-
 def test_blocks_tracks_and_cells_are_added_up() -> None:
     """Their sum, as far as it is more than nothing, on top of the model; without the jackknife,
     frames in place of blocks."""
-    graph = build(drifting(problem_of(), 2.0), GraphOptions(SIGMA_PX))
+    graph = build(drifting(problem_of(), 2.0, 0), GraphOptions(SIGMA_PX))
     estimate, values, _ = solve(graph)
     covariance = calibration_covariance(graph, estimate, values, min_parallax_deg=1.0)
     assert covariance.jackknife is not None

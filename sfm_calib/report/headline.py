@@ -8,11 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from graphs.problem import Problem
+from graphs.problem import Problem, images_seen
 from sfm_calib.report.digits import short
 from sfm_calib.report.rows import Z_ALARM, TruthRow
-from sfm_calib.report.weak import OF_LENS
-from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration, Verdict
+from sfm_calib.result import OF_LENS, PRIOR_DECIDES_SHARE, Calibration, Verdict
 
 Tone = Literal["good", "doubtful", "bad", "unknown"]
 
@@ -86,7 +85,7 @@ def key_figures(calibration: Calibration, problem: Problem) -> tuple[Figure, ...
     """The numbers under the verdict."""
     solve, noise = calibration.solve, calibration.noise
     observations = problem.observations
-    seen = np.unique(np.column_stack([observations.frame, observations.camera]), axis=0)
+    seen = images_seen(observations)
     n_images = solve.n_images if solve else len(seen)
     n_frames = solve.n_frames if solve else len(problem.frame_names)
     n_observations = solve.n_observations if solve else len(observations)

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_calib.report.digits import short
-from sfm_calib.result import Calibration, WeakDirection
+from sfm_calib.result import OF_LENS, Calibration, WeakDirection
 
 IN_PX = ("fx", "fy", "cx", "cy")
-OF_LENS = "choice of the lens"  # the kind that is no direction: what another lens would change
 MUCH_MORE = 1.2  # what data alone leave open, over what they do with priors: worth saying
 
 
