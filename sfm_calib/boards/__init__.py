@@ -1,0 +1,1 @@
+"""Calibration targets: their description, their detection in images, and their printing."""
