@@ -50,7 +50,7 @@ def within_budget(
     Raises ValueError when the problem, or what is left of it, determines too little.
     """
     seen = problem.observations
-    if len(seen) <= max_observations:
+    if np.count_nonzero(~problem.known[seen.point]) <= max_observations:
         return problem, None
     sigma, leverage = _information(problem, options)
     length = np.bincount(seen.point, minlength=len(problem.initial.points))
@@ -58,6 +58,7 @@ def within_budget(
         worth = np.where(length > 0, leverage / length, 0.0)
     by_worth = np.argsort(-worth, kind="stable")
     keep = _spread_over_images(problem, length, by_worth, max_observations)
+    keep |= problem.known
     if isinstance(problem.scale, KnownSpan):
         keep[list(problem.scale.points)] = True
     chosen = compact(problem, seen.subset(keep[seen.point]))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from graphs.boards import insert_board, shape_prior_factor
 from graphs.clusters import Tracks, make_tracks
 from graphs.frames import NOT_SMART, FloatArray, to_gtsam_inverse
 from graphs.gauge import add_gauge
@@ -77,6 +78,8 @@ def build(
         others.add(rig_prior_factor(index, rig_prior))
     add_gauge(others, problem)
     noise = root_information(problem, options)
+    if problem.board is not None:
+        others.add(shape_prior_factor(problem.board.board))
     if problem.scale is not None:
         others.add(scale_factor(problem, noise, lens_of, options.loss, options.loss_scale))
     initial = initial_values(problem, lens_of)
@@ -188,4 +191,5 @@ def initial_values(problem: Problem, lens_of: tuple[int, ...]) -> gtsam.Values:
         values.insert(rig_key(index), to_gtsam_inverse(cam_from_rig))
     for index, rig_from_world in enumerate(start.rig_from_world):
         values.insert(frame_key(index), to_gtsam_inverse(rig_from_world))
+    insert_board(values, problem)
     return values

@@ -16,7 +16,7 @@ from graphs.elimination import Elimination
 from graphs.frames import FloatArray
 from graphs.losses import LossName
 from graphs.points import FARTHEST
-from graphs.problem import IntArray, Problem
+from graphs.problem import BoolArray, IntArray, Problem
 
 CHUNK = 2048  # observations a chunk: its scratch stays in the second-level cache
 # A large front's tracks are cut, so that threads share them, into at most so many matrices.
@@ -38,6 +38,8 @@ class Cluster:
     pixels: FloatArray  # (n_obs, 2)
     root_information: FloatArray  # (n_obs,) 1 / sigma of a pixel coordinate
     anchors: FloatArray  # (n_points, 3)
+    corner: IntArray | None = None  # (n_points,) of the board; None: points to be triangulated
+    still: IntArray | None = None  # (n_points,) 1: of the board in the scene's world
 
     @property
     def n_points(self) -> int:
@@ -70,6 +72,8 @@ class Cluster:
                 self.begins[first : last + 1] - self.begins[first], frame.astype(np.int32),
                 self.camera[rows], self.pixels[rows], self.root_information[rows],
                 self.anchors[first:last],
+                None if self.corner is None else self.corner[first:last],
+                None if self.still is None else self.still[first:last],
             )  # fmt: skip
 
 
@@ -81,6 +85,7 @@ class TrackColumns:
     lens: IntArray  # (n_cameras,) cameras may share one; all after the rigs'
     n_params: IntArray  # (n_cameras,)
     width: int  # of all rigs and lenses, the border's first
+    board: int = 0  # columns of the board, which come next
 
     @property
     def places(self) -> tuple[IntArray, IntArray, IntArray]:
@@ -118,7 +123,8 @@ def make_tracks(
     at = position[seen.frame]
     earliest = np.full(len(start.points), len(position))
     np.minimum.at(earliest, seen.point, at)
-    rows = np.lexsort((seen.camera, at, seen.point, earliest[seen.point]))
+    known = problem.known
+    rows = np.lexsort((seen.camera, at, seen.point, known[seen.point], earliest[seen.point]))
     point = seen.point[rows]
     first_row = np.flatnonzero(np.diff(point, prepend=-1))
     order = point[first_row]
@@ -127,10 +133,14 @@ def make_tracks(
     distance = np.linalg.norm(start.points[order] - anchors, axis=1)
     front = elimination.front_of[earliest[order]]
     clusters = []
-    for first, last in _cuts(front, begins, elimination):
+    for first, last in _cuts(front, known[order], begins, elimination):
         of_cluster = slice(begins[first], begins[last])
         frames = elimination.fronts[front[first]].frames
         mine = rows[of_cluster]
+        corner = still = None
+        if problem.board is not None and known[order[first]]:
+            corner = problem.board.corner[order[first:last]]
+            still = problem.board.still[order[first:last]].astype(np.int64)
         clusters.append(
             Cluster(
                 front=int(front[first]),
@@ -142,6 +152,8 @@ def make_tracks(
                 pixels=seen.pixels[mine],
                 root_information=root_information[mine],
                 anchors=anchors[first:last],
+                corner=corner,
+                still=still,
             )
         )
     return Tracks(
@@ -170,9 +182,11 @@ def _anchors(problem: Problem, rows: IntArray, begins: IntArray) -> FloatArray:
     return centres[is_farthest[first]]
 
 
-def _cuts(front: IntArray, begins: IntArray, elimination: Elimination) -> Iterator[tuple[int, int]]:
-    """Ranges of points of one front each, large ones in parts that threads share."""
-    edges = [*np.flatnonzero(np.diff(front, prepend=-1)).tolist(), len(front)]
+def _cuts(
+    front: IntArray, known: BoolArray, begins: IntArray, elimination: Elimination
+) -> Iterator[tuple[int, int]]:
+    """Ranges of points of one front and one kind each, large ones in parts that threads share."""
+    edges = [*np.flatnonzero(np.diff(2 * front + known, prepend=-1)).tolist(), len(front)]
     for first, last in itertools.pairwise(edges):
         size = len(elimination.columns(elimination.fronts[front[first]]))
         room = max(MOST_PARTS_BYTES // (8 * size * size), 1)

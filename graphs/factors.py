@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
+from graphs.boards import board_keys
 from graphs.build import CalibrationGraph
 from graphs.clusters import Cluster, homogeneous
 from graphs.frames import FloatArray
@@ -51,6 +52,7 @@ def track_factor(
     """One cluster as a factor; `points` (n_points, 4) is where triangulation starts."""
     keys, columns = _variables(graph, cluster)
     size = sum(column.size for column in columns)
+    width = graph.layout.of_tracks.width + graph.layout.of_tracks.board
     warm = points.copy()  # where the last linearisation found the points
 
     def error(
@@ -62,9 +64,7 @@ def track_factor(
         if jacobians is None:
             return np.append(np.zeros(size), np.sqrt(2 * cost))
         warm[:] = found
-        H, g = linearise_cluster(
-            graph.tracks, cluster, variables, found, graph.layout.of_tracks.width
-        )
+        H, g = linearise_cluster(graph.tracks, cluster, variables, found, width)
         used = np.concatenate(columns)
         A, e = square_root(H[np.ix_(used, used)], g[used], cost)
         ends = np.cumsum([column.size for column in columns])
@@ -89,6 +89,11 @@ def _variables(graph: CalibrationGraph, cluster: Cluster) -> tuple[list[int], li
     for lens in sorted({layout.lens_of[camera] for camera in cameras}):
         keys.append(lens_key(lens))
         columns.append(start + of_tracks.lens[lens] + np.arange(of_tracks.n_params[lens]))
+    if cluster.corner is not None:
+        first = start - layout.size[frame_key(0)] * len(layout.elimination.order)
+        for key in board_keys(graph.problem):
+            keys.append(key)
+            columns.append(first + layout.columns(key))
     return keys, columns
 
 

@@ -27,15 +27,20 @@ class Gauge:
     cameras: tuple[int, int] | None = None
 
 
-def choose_gauge(problem: Problem) -> Gauge:
+def choose_gauge(problem: Problem) -> Gauge | None:
     """Hold the best-seen frame, and the longest distance the scene offers.
+
+    Frames whose world is a board need no hold; None where there are no others.
 
     Raises ValueError when every frame and camera stands at one point: there is no size to hold.
     """
+    of_scene = ~problem.board_frames
+    if not of_scene.any():
+        return None
     counts = np.bincount(problem.observations.frame, minlength=len(problem.frame_names))
-    frame = int(counts.argmax())
+    frame = int((counts * of_scene).argmax())
     centres = np.array([t.inverse.translation for t in problem.initial.rig_from_world])
-    from_frame = np.linalg.norm(centres - centres[frame], axis=1)
+    from_frame = np.linalg.norm(centres - centres[frame], axis=1) * of_scene
     cameras = [t.inverse.translation for t in problem.initial.cam_from_rig]
     baselines = np.linalg.norm(np.array(cameras) - cameras[problem.reference], axis=1)
     path, baseline = float(from_frame.max()), float(baselines.max())
@@ -49,15 +54,17 @@ def choose_gauge(problem: Problem) -> Gauge:
 def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     """Hold seven degrees of freedom and the reference camera.
 
-    With a scale source, whose factor `graphs.scale` makes, only six: the size is not held.
+    With a source of scale, a measured distance or a board, only six: the size is not held.
     """
     gauge = choose_gauge(problem)
+    graph.add(hold_reference(problem, gauge))
+    if gauge is None:
+        return
     sigma = GAUGE_SIGMA * gauge.distance
     held = gtsam.noiseModel.Diagonal.Sigmas(np.array([GAUGE_SIGMA] * 3 + [sigma] * 3), NOT_SMART)
     pose = to_gtsam_inverse(problem.initial.rig_from_world[gauge.frame])
     graph.add(gtsam.PriorFactorPose3(frame_key(gauge.frame), pose, held))
-    graph.add(hold_reference(problem, gauge))
-    if problem.scale is not None:
+    if problem.metric:
         return
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
     pair = gauge.frames or gauge.cameras
@@ -66,11 +73,11 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     graph.add(gtsam.RangeFactorPose3(key(pair[0]), key(pair[1]), gauge.distance, noise))
 
 
-def hold_reference(problem: Problem, gauge: Gauge) -> gtsam.NonlinearFactor:
+def hold_reference(problem: Problem, gauge: Gauge | None) -> gtsam.NonlinearFactor:
     """The reference camera at the identity, for factors that ask where it is: a baseline."""
     centres = [t.inverse.translation for t in problem.initial.cam_from_rig]
     size = max(float(np.linalg.norm(c - centres[problem.reference])) for c in centres)
-    sigma = REFERENCE_SIGMA * (size or gauge.distance)
+    sigma = REFERENCE_SIGMA * (size or (gauge.distance if gauge else 1.0))
     sigmas = np.array([REFERENCE_SIGMA] * 3 + [sigma] * 3)
     identity = to_gtsam_inverse(Transform.identity())
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas, NOT_SMART)

@@ -41,11 +41,12 @@ def held_out_costs(problem: Problem, options: GraphOptions, n_folds: int) -> Flo
     fold = np.arange(len(problem.frame_names)) % n_folds
     for index in range(n_folds):
         held = fold[problem.observations.frame] == index
-        train = well_seen(problem.observations, ~held)
+        train = well_seen(problem.observations, ~held, problem.known)
         if not train.any():
             raise ValueError("too few points are seen often enough without a part of the frames")
         fitted = _fit(problem, options, train)
-        rows = held & np.isin(problem.observations.point, problem.observations.point[train])
+        seen_too = np.isin(problem.observations.point, problem.observations.point[train])
+        rows = held & (seen_too | problem.known[problem.observations.point])
         in_frame = np.bincount(problem.observations.frame[rows], minlength=len(fold))
         rows &= in_frame[problem.observations.frame] >= MIN_IN_FRAME
         if rows.any():
@@ -53,12 +54,20 @@ def held_out_costs(problem: Problem, options: GraphOptions, n_folds: int) -> Flo
     return costs
 
 
-def well_seen(seen: Observations, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Of the observations to keep (n_obs,), those of long tracks and of frames that see enough."""
+def well_seen(
+    seen: Observations, keep: NDArray[np.bool_], known: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    """Of the observations to keep (n_obs,), those of long tracks and of frames that see enough.
+
+    known (n_points,): corners of a board, which need no track.
+    """
     while True:
         length = np.bincount(seen.point[keep], minlength=int(seen.point.max()) + 1)
         in_frame = np.bincount(seen.frame[keep], minlength=int(seen.frame.max()) + 1)
-        enough = (length >= MIN_TRACK_LENGTH)[seen.point] & (in_frame >= MIN_IN_FRAME)[seen.frame]
+        long = length >= MIN_TRACK_LENGTH
+        if known is not None:
+            long |= known[: len(length)]
+        enough = long[seen.point] & (in_frame >= MIN_IN_FRAME)[seen.frame]
         if (enough | ~keep).all():
             return keep
         keep = keep & enough

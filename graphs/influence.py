@@ -72,7 +72,8 @@ def influences(
     layout, n = graph.layout, response.shape[1]
     start = 6 * len(layout.elimination.order)
     frames = 6 * cluster.frames[:, None] + np.arange(6)
-    place = np.append(frames.ravel(), start + np.arange(layout.of_tracks.width))
+    shared = layout.of_tracks.width + layout.of_tracks.board
+    place = np.append(frames.ravel(), start + np.arange(shared))
     G = response[place]
     for chunk in rows_of(graph.tracks, cluster, variables, points[cluster.points]):
         n_rows, begins = len(chunk.rows), chunk.begins[chunk.active]
@@ -82,6 +83,8 @@ def influences(
             chunk.rows, chunk.of_frame, chunk.of_rig, chunk.of_lens, chunk.n_frames,
             *layout.of_tracks.places, G, of_rows,
         )  # fmt: skip
+        if chunk.of_board is not None:
+            of_rows += chunk.of_board @ G[len(G) - layout.of_tracks.board :]
         follow_points(
             chunk.active, chunk.begins, chunk.points, chunk.smallest_w, chunk.residuals,
             chunk.of_point, of_rows, moved, leverage,
@@ -90,30 +93,47 @@ def influences(
 
 
 class SharedErrors:
-    """Sums of influences over frames, over cells of the image plane, over tracks, and over none."""
+    """Sums of influences over frames, over cells of the image plane, over tracks, and over none.
 
-    def __init__(self, n_frames: int, n_cameras: int, n: int) -> None:
+    Corners of a board are no tracks: what is printed wrongly errs alike in all frames.
+    """
+
+    def __init__(self, n_frames: int, n_cameras: int, n: int, n_corners: int = 0) -> None:
         self.by_frame = np.zeros((n_frames, n))
         self.by_cell = np.zeros((n_cameras * CELLS * CELLS, n))
         self.by_track = np.zeros((n, n))  # sum of outer products
         self.n_tracks = 0
-        self.alone = 0.0  # sum of squares
-        self.before_fit = 0.0  # the same, had the points not been fitted to them
+        self.by_corner = np.zeros((n_corners, n))
+        # Sums of outer products of single observations: of tracks, had their points not been
+        # fitted to them, and of corners.
+        self.before_fit = np.zeros((n, n))
+        self.of_corners = np.zeros((n, n))
+        self.alone = 0.0  # sum of squares of all
 
     def add(
-        self, influence: Influence, frame: IntArray, cell: IntArray, weight: FloatArray
+        self,
+        influence: Influence,
+        frame: IntArray,
+        cell: IntArray,
+        weight: FloatArray,
+        corner: IntArray | None = None,
     ) -> None:
-        """`frame`, `cell`, `weight` (n_obs,): of each observation."""
-        np.add.at(self.by_frame, frame, influence.moved)
-        np.add.at(self.by_cell, cell, influence.moved)
-        of_tracks = np.add.reduceat(influence.moved, influence.begins)
+        """`frame`, `cell`, `weight`, `corner` (n_obs,): of each observation."""
+        moved = influence.moved
+        np.add.at(self.by_frame, frame, moved)
+        np.add.at(self.by_cell, cell, moved)
+        squares = (moved**2).sum(1)
+        self.alone += float(squares.sum())
+        if corner is not None:
+            np.add.at(self.by_corner, corner, moved)
+            self.of_corners += moved.T @ moved
+            return
+        of_tracks = np.add.reduceat(moved, influence.begins)
         self.by_track += of_tracks.T @ of_tracks
         self.n_tracks += len(of_tracks)
-        squares = (influence.moved**2).sum(1)
-        self.alone += float(squares.sum())
         lengths = np.diff(influence.begins, append=len(squares))
         of_track = np.repeat(np.add.reduceat(weight, influence.begins), lengths)
-        self.before_fit += float((squares / left_by_point(weight, of_track)).sum())
+        self.before_fit += moved.T @ (moved / left_by_point(weight, of_track)[:, None])
 
     def merge(self, other: SharedErrors, frames: IntArray) -> None:
         """Add what other tracks moved; `frames`: which of ours theirs are."""
@@ -121,8 +141,10 @@ class SharedErrors:
         self.by_cell += other.by_cell
         self.by_track += other.by_track
         self.n_tracks += other.n_tracks
-        self.alone += other.alone
+        self.by_corner += other.by_corner
         self.before_fit += other.before_fit
+        self.of_corners += other.of_corners
+        self.alone += other.alone
 
 
 def shared_errors(
@@ -134,19 +156,22 @@ def shared_errors(
 ) -> SharedErrors:
     """The influences of all observations on n unknowns; response (n_columns, n)."""
     cameras, n = graph.problem.initial.cameras, response.shape[1]
+    board = graph.problem.board
+    n_corners = 0 if board is None else len(board.board.corners)
     sizes = np.array([camera.size for camera in cameras])
 
     def run(cluster: Cluster) -> SharedErrors:
-        sums = SharedErrors(len(cluster.frames), len(cameras), n)
+        sums = SharedErrors(len(cluster.frames), len(cameras), n, n_corners)
         for influence in influences(graph, cluster, variables, points, response):
-            observation, _, frame, camera = influence.rows.T
+            observation, point, frame, camera = influence.rows.T
             inside = cluster.pixels[observation] / sizes[camera]
             x, y = np.clip((inside * CELLS).astype(np.int64), 0, CELLS - 1).T
             weight = cluster.root_information[observation] ** 2
-            sums.add(influence, frame, (camera * CELLS + y) * CELLS + x, weight)
+            corner = None if cluster.corner is None else cluster.corner[point]
+            sums.add(influence, frame, (camera * CELLS + y) * CELLS + x, weight, corner)
         return sums
 
-    total = SharedErrors(len(graph.problem.frame_names), len(cameras), n)
+    total = SharedErrors(len(graph.problem.frame_names), len(cameras), n, n_corners)
     clusters = graph.tracks.clusters
     for cluster, sums in zip(clusters, pool.map(run, clusters), strict=True):
         total.merge(sums, cluster.frames)

@@ -54,12 +54,21 @@ class Jackknife:
 
 
 def blocks_of(problem: Problem, most: int = BLOCKS) -> IntArray:
-    """The block (n_frames,) of each frame, in the order of the scan, all about equally long."""
+    """The block (n_frames,) of each frame, in the order of the scan, all about equally long.
+
+    Frames of a board are a series of their own beside those of the scan.
+    """
     n_frames = len(problem.frame_names)
     count = min(most, n_frames // FRAMES_A_BLOCK)
     if count < min(most, FEWEST_BLOCKS):
         count = min(most, n_frames)
-    return np.arange(n_frames) * count // n_frames
+    place = np.arange(n_frames) / n_frames
+    of_board = problem.board_frames
+    if of_board.any() and not of_board.all():  # each block takes its share of both kinds
+        for kind in (of_board, ~of_board):
+            place[kind] = (np.arange(kind.sum()) + 0.5) / kind.sum()
+    block: IntArray = (place * count).astype(np.int64)
+    return block
 
 
 def delete_group_jackknife(
@@ -144,8 +153,12 @@ def tangent(in_unit: Estimate, model: ModelCovariance) -> FloatArray:
 
 
 def _of_scale(problem: Problem) -> IntArray:
-    """Frames without which a measured distance gives no unit: of a path's ends, of clicks."""
+    """Frames without which nothing gives a unit: of a path's ends, of clicks, the one that sees a
+    board."""
     scale, seen = problem.scale, problem.observations
+    with_board = np.unique(seen.frame[problem.known[seen.point]])
+    if scale is None and len(with_board) == 1:
+        return with_board
     if isinstance(scale, KnownPath):
         return np.array(scale.frames)
     if isinstance(scale, KnownSpan):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gtsam.symbol_shorthand import K, L, T, X
+from gtsam.symbol_shorthand import B, K, L, S, T, X
 
 
 def frame_key(frame: int) -> int:
@@ -23,3 +23,13 @@ def lens_key(camera: int) -> int:
 def point_key(point: int) -> int:
     """A scene point."""
     return L(point)
+
+
+def board_key() -> int:
+    """world_from_board of the board that stays put in a scan."""
+    return B(0)
+
+
+def shape_key() -> int:
+    """The size and the bends of the board."""
+    return S(0)

@@ -30,8 +30,11 @@ def free_dimensions(problem: Problem, options: GraphOptions | None = None) -> in
     options: say which lens parameters are held, and which cameras share theirs; else all count.
     """
     start, seen = problem.initial, problem.observations
-    frames, points = len(np.unique(seen.frame)), len(np.unique(seen.point))
-    gauge = 7 if problem.scale is None else 6
+    frames = len(np.unique(seen.frame))
+    points = int(np.count_nonzero(~problem.known[np.unique(seen.point)]))
+    gauge = 6 if problem.metric else 7
+    if problem.board_frames.all():
+        gauge = 0
     rig = 6 * (len(start.cameras) - 1)
     return _free_lens_parameters(problem, options) + rig + 6 * frames + 3 * points - gauge
 
@@ -59,7 +62,7 @@ def redundancies(problem: Problem, options: GraphOptions | None = None) -> Float
     seen = problem.observations
     weight = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma**-2.0
     of_track: FloatArray = np.bincount(seen.point, weight).astype(np.float64)[seen.point]
-    left = left_by_point(weight, of_track)
+    left = np.where(problem.known[seen.point], 1.0, left_by_point(weight, of_track))
     result: FloatArray = left * redundancy(problem, options) / float(left.mean())
     return result
 

@@ -12,6 +12,7 @@ from graphs.camera import Camera, project
 from graphs.frames import FloatArray, Transform
 
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Estimate:
     cam_from_rig: tuple[Transform, ...]  # one a camera; the reference camera's is the identity
     rig_from_world: tuple[Transform, ...]  # one a frame
     points: FloatArray  # (n_points, 3) in the world
+    world_from_board: Transform | None = None  # of the board that stays put; None: there is none
+    board_shape: FloatArray | None = None  # (3,) as `graphs.boards.corners_of` takes it
 
     def scaled(self, factor: float) -> Estimate:
         """The same scene in units `factor` times smaller."""
@@ -82,6 +85,10 @@ class Estimate:
             cam_from_rig=tuple(t.scaled(factor) for t in self.cam_from_rig),
             rig_from_world=tuple(t.scaled(factor) for t in self.rig_from_world),
             points=self.points * factor,
+            world_from_board=self.world_from_board and self.world_from_board.scaled(factor),
+            board_shape=None
+            if self.board_shape is None
+            else self.board_shape + np.array([np.log(factor), 0.0, 0.0]),
         )
 
 
@@ -117,6 +124,29 @@ ScaleSource = KnownBaseline | KnownPath | KnownSpan
 
 
 @dataclass(frozen=True)
+class Board:
+    """A flat target: its corners as stated, and what is known of its size and flatness."""
+
+    corners: FloatArray  # (n, 3) in the board's frame, in m
+    shape_mean: FloatArray  # (3,) as `graphs.boards.corners_of` takes it
+    shape_sigma: FloatArray  # (3,) relative, and of the bends in m; 0: held
+
+
+@dataclass(frozen=True)
+class BoardPoints:
+    """Which points of a problem are corners of its board. Each is a corner as one frame sees it."""
+
+    board: Board
+    corner: IntArray  # (n_points,) -1: a point of the scene
+    still: BoolArray  # (n_points,) the board stays put in the scene; else it is its frame's world
+
+    @property
+    def known(self) -> BoolArray:
+        """Whether each point is a corner (n_points,)."""
+        return self.corner >= 0
+
+
+@dataclass(frozen=True)
 class Problem:
     """Everything the graph needs: observations, and where to start."""
 
@@ -125,6 +155,40 @@ class Problem:
     frame_names: tuple[str, ...]
     reference: int = 0  # index of the camera whose frame is the rig's frame
     scale: ScaleSource | None = None
+    board: BoardPoints | None = None
+
+    @property
+    def known(self) -> BoolArray:
+        """Points (n_points,) that are corners of the board."""
+        if self.board is None:
+            return np.zeros(len(self.initial.points), dtype=bool)
+        return self.board.known
+
+    @property
+    def board_frames(self) -> BoolArray:
+        """Frames (n_frames,) whose world is the board's: nothing else is seen in them."""
+        frames = np.zeros(len(self.frame_names), dtype=bool)
+        if self.board is not None:
+            own = self.board.known & ~self.board.still
+            frames[self.observations.frame[own[self.observations.point]]] = True
+        return frames
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths of the rig are in metres: measured, or seen against a board."""
+        return self.scale is not None or self._board_gives_scale
+
+    @property
+    def _board_gives_scale(self) -> bool:
+        # What two cameras see at once, or what stands in the scene itself.
+        if self.board is None:
+            return False
+        seen = self.observations
+        rows = self.board.known[seen.point]
+        if self.board.still[seen.point[rows]].any():
+            return True
+        images = np.unique(np.stack([seen.frame[rows], seen.camera[rows]], axis=1), axis=0)
+        return len(np.unique(images[:, 0])) < len(images)
 
 
 def points_in_cameras(estimate: Estimate, observations: Observations) -> FloatArray:

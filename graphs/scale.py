@@ -103,7 +103,11 @@ class _Span:
         point = np.searchsorted(np.sort(scale.points), observations.point)
         ends = replace(problem.initial, points=problem.initial.points[np.sort(scale.points)])
         self.problem = replace(
-            problem, initial=ends, observations=replace(observations, point=point), scale=None
+            problem,
+            initial=ends,
+            observations=replace(observations, point=point),
+            scale=None,
+            board=None,
         )
         columns = track_columns(problem, lens_of)
         self.order = np.arange(len(problem.frame_names))

@@ -9,7 +9,8 @@ from numba import njit
 
 from graphs.frames import FloatArray
 from graphs.problem import (
-    Estimate,
+    BoardPoints,
+    BoolArray,
     IntArray,
     KnownPath,
     KnownSpan,
@@ -19,6 +20,7 @@ from graphs.problem import (
 )
 
 MIN_TRACK_LENGTH = 3  # two views of a point cannot show that one is wrong
+MIN_CORNERS = 6  # of a board in one image: twice what its place takes
 
 
 class NoParallaxError(ValueError):
@@ -33,12 +35,25 @@ def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
     seen = problem.observations
     length = np.bincount(seen.point, minlength=len(problem.initial.points))
     keep = (length >= MIN_TRACK_LENGTH) & (parallax_deg(problem) >= min_parallax_deg)
+    keep = np.where(problem.known, _in_enough_company(problem), keep)
     if not keep.any():
         raise NoParallaxError(
             f"none of {len(length)} points is seen {MIN_TRACK_LENGTH} times with "
             f"{min_parallax_deg:g} deg of parallax: move the camera sideways, closer to things"
         )
     return compact(problem, seen.subset(keep[seen.point]))
+
+
+def _in_enough_company(problem: Problem) -> BoolArray:
+    """Points (n_points,) that one camera sees together with enough other corners of the board."""
+    seen, enough = problem.observations, np.zeros(len(problem.initial.points), dtype=bool)
+    rows = problem.known[seen.point]
+    image = seen.frame * len(problem.initial.cameras) + seen.camera
+    count = np.bincount(image[rows], minlength=int(image.max(initial=0)) + 1)
+    best = np.zeros(len(problem.frame_names), dtype=np.int64)
+    np.maximum.at(best, seen.frame[rows], count[image[rows]])
+    enough[seen.point[rows]] = best[seen.frame[rows]] >= MIN_CORNERS
+    return enough
 
 
 def compact(problem: Problem, observations: Observations) -> Problem:
@@ -51,16 +66,23 @@ def compact(problem: Problem, observations: Observations) -> Problem:
     frames, frame = np.unique(observations.frame, return_inverse=True)
     return replace(
         problem,
-        initial=Estimate(
-            start.cameras,
-            start.cam_from_rig,
-            tuple(start.rig_from_world[f] for f in frames),
-            start.points[points],
+        initial=replace(
+            start,
+            rig_from_world=tuple(start.rig_from_world[f] for f in frames),
+            points=start.points[points],
         ),
         observations=replace(observations, point=point, frame=frame),
         frame_names=tuple(problem.frame_names[f] for f in frames),
         scale=_renumbered(problem, frames, points),
+        board=_board_of(problem, points),
     )
+
+
+def _board_of(problem: Problem, points: IntArray) -> BoardPoints | None:
+    board = problem.board
+    if board is None or not board.known[points].any():
+        return None
+    return replace(board, corner=board.corner[points], still=board.still[points])
 
 
 def _renumbered(problem: Problem, frames: IntArray, points: IntArray) -> ScaleSource | None:

@@ -14,7 +14,7 @@ from graphs.build import CalibrationGraph
 from graphs.clusters import euclidean, homogeneous
 from graphs.elimination import NotPositiveDefiniteError
 from graphs.frames import FloatArray, Transform, from_gtsam_inverse
-from graphs.keys import frame_key, lens_key, rig_key
+from graphs.keys import board_key, frame_key, lens_key, rig_key, shape_key
 from graphs.problem import Estimate
 from graphs.system import System, assemble
 from graphs.tracks import TRIANGULATION_TOLERANCE, Variables, triangulate
@@ -187,4 +187,8 @@ def estimate_from(graph: CalibrationGraph, state: State) -> Estimate:
             for i in range(len(start.rig_from_world))
         ),
         euclidean(graph.tracks, state.points, start.points),
+        from_gtsam_inverse(values.atPose3(board_key())).inverse
+        if values.exists(board_key())
+        else None,
+        values.atVector(shape_key()) if values.exists(shape_key()) else None,
     )

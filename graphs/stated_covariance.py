@@ -34,6 +34,7 @@ from graphs.shrinkage import shrunk
 from graphs.solve import threads
 
 MIN_FRAMES = 5  # fewer cannot show how much frames differ
+MIN_CLUSTERS = 5  # of tracks, and of corners
 # Of the variance of a parameter, correlations taken out: less of it is rounding. Real lenses'
 # weakest combinations have 1e-6.
 LEAST_EIGENVALUE = 1e-10
@@ -98,7 +99,7 @@ def calibration_covariance(
             graph, graph.variables(values), points, model.response @ whiten.T, pool
         )
     frames = _of_frames(shared)
-    others = _of_tracks(shared) + _of_cells(shared)
+    others = _of_tracks(shared) + _of_corners(shared) + _of_cells(shared)
     robust = _widened(model, root, frames + others)
     stated, jackknife = robust, None
     if min_parallax_deg is not None:
@@ -137,7 +138,15 @@ def _of_frames(shared: SharedErrors) -> FloatArray:
 def _of_tracks(shared: SharedErrors) -> FloatArray:
     # What moves a track's point moves nothing else: the sum over a track is free of its fit, and
     # to be compared with residuals that are.
-    return _excess(shared.by_track, shared.n_tracks, shared.before_fit)
+    if len(shared.by_corner):
+        return _excess_of_part(shared.by_track, shared.n_tracks, shared.before_fit, shared.alone)
+    return _excess(shared.by_track, shared.n_tracks, float(np.trace(shared.before_fit)))
+
+
+def _of_corners(shared: SharedErrors) -> FloatArray:
+    """What corners of the board err in all frames alike: printed wrongly, or found wrongly."""
+    seen = shared.by_corner[shared.by_corner.any(axis=1)]
+    return _excess_of_part(seen.T @ seen, len(seen), shared.of_corners, shared.alone)
 
 
 def _of_cells(shared: SharedErrors) -> FloatArray:
@@ -150,6 +159,25 @@ def _excess(scatter: FloatArray, n_clusters: int, independent: float) -> FloatAr
     alone = independent / len(scatter)
     finite = n_clusters / max(n_clusters - 1, 1)
     result: FloatArray = finite * shrunk(scatter, n_clusters) / alone - np.eye(len(scatter))
+    return result
+
+
+def _excess_of_part(
+    scatter: FloatArray, n_clusters: int, independent: FloatArray, of_all: float
+) -> FloatArray:
+    """The same of clusters that hold a part of the data, such as the corners of a board alone.
+
+    independent (n, n): the scatter if these were independent, which a part has a shape of its own
+    for; of_all: the trace of that of all the data.
+    """
+    values, vectors = np.linalg.eigh(independent)
+    kept = values > LEAST_EIGENVALUE * of_all
+    if n_clusters < MIN_CLUSTERS or not kept.any():
+        return np.zeros_like(scatter)
+    root = vectors[:, kept] * np.sqrt(values[kept])
+    whiten = (vectors[:, kept] / np.sqrt(values[kept])).T
+    excess = _excess(whiten @ scatter @ whiten.T, n_clusters, float(kept.sum()))
+    result: FloatArray = root @ excess @ root.T * (len(scatter) / of_all)
     return result
 
 

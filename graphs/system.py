@@ -15,6 +15,7 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
+from graphs.boards import board_keys, board_width, place_corners
 from graphs.camera import valid_limit
 from graphs.clusters import TrackColumns, Tracks
 from graphs.elimination import (
@@ -68,7 +69,9 @@ def make_layout(
     size = {key: int(zero.at(key).size) for key in keys}
     of_tracks = track_columns(problem, lens_of)
     shared = shared_keys(problem, lens_of)
-    rest = [key for key in keys if key not in frame_of and key not in shared]
+    of_board = board_keys(problem)  # next to what tracks know, for they are tracks too
+    others_of = [key for key in keys if key not in frame_of and key not in shared]
+    rest = [*of_board, *(key for key in others_of if key not in of_board)]
     border = of_tracks.width + sum(size[key] for key in rest)
     elimination = plan_elimination(linked, border)
     first_column = {frame_key(f): FRAME_SIZE * p for p, f in enumerate(elimination.order)}
@@ -96,7 +99,7 @@ def track_columns(problem: Problem, lens_of: tuple[int, ...]) -> TrackColumns:
     lens = np.empty(len(cameras), dtype=np.int64)
     for i in sorted(set(lens_of)):
         lens[i], width = width, width + n_params[i]
-    return TrackColumns(rig, lens[list(lens_of)], n_params, int(width))
+    return TrackColumns(rig, lens[list(lens_of)], n_params, int(width), board_width(problem))
 
 
 def _linked_frames(frame: IntArray, point: IntArray, n_frames: int) -> NDArray[np.bool_]:
@@ -152,6 +155,7 @@ def variables_of(
         np.array([MODEL_INDEX[camera.lens] for camera in cameras]),
         params,
         limits,
+        None if problem.board is None else place_corners(problem.board.board, values),
     )
 
 

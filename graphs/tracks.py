@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphs.clusters import Cluster, Tracks
+from graphs.boards import Corners
+from graphs.clusters import Cluster, TrackColumns, Tracks
 from graphs.frames import FloatArray
 from graphs.lenses import project_many, project_point_many
 from graphs.losses import LOSS_INDEX, weigh_many
@@ -38,6 +39,7 @@ class Variables:
     models: IntArray  # (n_cameras,) MODEL_INDEX
     params: FloatArray  # (n_cameras, n) padded with zeros
     limits: FloatArray  # (n_cameras,) of the valid region
+    corners: Corners | None = None  # of the board
 
     def poses(self, frames: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Rotations and centres of these frames and of all cameras, as the kernels take them."""
@@ -55,7 +57,7 @@ class Variables:
 
 
 class Rows(NamedTuple):
-    """Linearised, weighted rows of a chunk, in the order in which the kernels take them."""
+    """Linearised, weighted rows of a chunk; all but the last in the order of the kernels."""
 
     active: IntArray  # (n_active,) points of the cluster
     begins: IntArray  # (n_points + 1,)
@@ -68,6 +70,7 @@ class Rows(NamedTuple):
     of_rig: FloatArray  # (n, 2, 6)
     of_lens: FloatArray  # (n, 2, n_params)
     n_frames: int
+    of_board: FloatArray | None  # (n, 2, k) of corners, whose `of_point` is zero
 
 
 class Scratch:
@@ -118,6 +121,8 @@ def triangulate_cluster(
 ) -> float:
     """As `triangulate`, of one cluster, its points (n_points, 4) in place; returns their cost."""
     poses, s = variables.poses(cluster.frames), Scratch(cluster, 0)
+    if cluster.corner is not None:
+        return _place_cluster(tracks, cluster, variables, points)
     if before is not None:
         carry_points(
             cluster.begins, cluster.frame, cluster.camera, cluster.anchors,
@@ -156,6 +161,40 @@ def triangulate_cluster(
         if waiting.size == 0:
             break
     return float(cost.sum())
+
+
+def _place_cluster(
+    tracks: Tracks, cluster: Cluster, variables: Variables, points: FloatArray
+) -> float:
+    """Put a cluster's corners (n_points, 4) where the board has them; returns their cost."""
+    assert variables.corners is not None
+    away = variables.corners.places[cluster.still, cluster.corner] - cluster.anchors
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    points[:] = np.hstack([away, np.ones_like(distance)]) / np.maximum(distance, 1e-300)
+    poses, s, cost = variables.poses(cluster.frames), Scratch(cluster, 0), 0.0
+    for active in cluster.chunks(np.arange(cluster.n_points)):
+        n = into_cameras(
+            active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, points,
+            *poses, s.rows, s.in_rig, s.in_cam,
+        )  # fmt: skip
+        project_point_many(
+            *variables.lenses, s.rows[:n, 3], s.in_cam[:n], s.pixels[:n], s.by_point[:n]
+        )
+        _weigh(tracks, cluster, s, n, s.rows[:n, 0])
+        cost += float(s.costs[:n].sum())
+    return cost
+
+
+def _by_board(cluster: Cluster, variables: Variables, s: Scratch, n: int) -> FloatArray:
+    """Rows (n, 2, k) by the board's variables, from those by the frames' places."""
+    assert variables.corners is not None and cluster.still is not None
+    assert cluster.corner is not None
+    world_from_rig = variables.rig_rotation[cluster.frames[s.rows[:n, 2]]]
+    point = s.rows[:n, 1]
+    by_board = variables.corners.by_board[cluster.still[point], cluster.corner[point]]
+    # A frame that moves one way sees what a corner that moves the other way shows.
+    result: FloatArray = -s.of_frame[:n, :, 3:] @ world_from_rig.mT @ by_board
+    return result
 
 
 def _weigh(tracks: Tracks, cluster: Cluster, s: Scratch, n: int, row: IntArray | slice) -> None:
@@ -199,8 +238,33 @@ def linearise_cluster(
     size = 6 * len(cluster.frames) + border
     H, g = np.zeros((size, size)), np.zeros(size)
     for chunk in rows_of(tracks, cluster, variables, points, newton):
-        eliminate_points(*chunk, *tracks.columns.places, tracks.columns.width, H, g)
+        eliminate_points(*chunk[:-1], *tracks.columns.places, tracks.columns.width, H, g)
+        if chunk.of_board is not None:
+            _add_board(chunk, chunk.of_board, tracks.columns, H, g)
     return H, g
+
+
+def _add_board(
+    chunk: Rows, of_board: FloatArray, columns: TrackColumns, H: FloatArray, g: FloatArray
+) -> None:
+    """Add what concerns the board's columns to the normal equations of a cluster."""
+    n, start, k = len(chunk.rows), 6 * chunk.n_frames, of_board.shape[2]
+    board = start + columns.width + np.arange(k)
+    frame, camera = chunk.rows[:, 2], chunk.rows[:, 3]
+    for index in np.unique(frame):
+        rows = frame == index
+        cross = np.tensordot(chunk.of_frame[:n][rows], of_board[rows], ([0, 1], [0, 1]))
+        H[6 * index : 6 * index + 6, board] += cross
+    for index in np.unique(camera):
+        rows, lens, size = camera == index, start + columns.lens[index], columns.n_params[index]
+        cross = np.tensordot(chunk.of_lens[:n][rows], of_board[rows], ([0, 1], [0, 1]))
+        H[lens : lens + size, board] += cross[:size]
+        if columns.rig[index] >= 0:
+            rig = start + columns.rig[index]
+            cross = np.tensordot(chunk.of_rig[:n][rows], of_board[rows], ([0, 1], [0, 1]))
+            H[rig : rig + 6, board] += cross
+    H[np.ix_(board, board)] += np.triu(np.tensordot(of_board, of_board, ([0, 1], [0, 1])))
+    g[board] += np.tensordot(of_board, chunk.residuals[:n], ([0, 1], [0, 1]))
 
 
 def rows_of(
@@ -229,7 +293,11 @@ def rows_of(
             s.by_params, s.in_rig, s.in_cam, s.weights, s.bends, s.residuals, s.of_point,
             s.of_frame, s.of_rig,
         )  # fmt: skip
+        of_board = None
+        if cluster.corner is not None:
+            s.of_point[:n] = 0.0  # nothing for a corner to give way to
+            of_board = _by_board(cluster, variables, s, n)
         yield Rows(
             active, cluster.begins, s.rows[:n], points, tracks.smallest_w, s.residuals,
-            s.of_point, s.of_frame, s.of_rig, s.by_params, len(cluster.frames),
+            s.of_point, s.of_frame, s.of_rig, s.by_params, len(cluster.frames), of_board,
         )  # fmt: skip

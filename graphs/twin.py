@@ -17,7 +17,7 @@ from graphs.frames import FloatArray
 from graphs.jackknife import change, tangent
 from graphs.model_covariance import calibration_columns
 from graphs.noise import redundancies
-from graphs.problem import Estimate, Problem, residuals_px
+from graphs.problem import BoardPoints, Estimate, Problem, residuals_px
 from graphs.refine import Refinement, refine
 from graphs.scale import length_of
 from graphs.stated_covariance import calibration_covariance, factors
@@ -103,8 +103,23 @@ def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
         measured = length_of(scale, estimate) + scale.sigma_m * rng.standard_normal()
         scale = replace(scale, length_m=measured)
     return replace(
-        problem, initial=estimate, observations=replace(seen, pixels=exact + noise), scale=scale
+        problem,
+        initial=estimate,
+        observations=replace(seen, pixels=exact + noise),
+        scale=scale,
+        board=_stated_anew(problem.board, estimate, rng),
     )
+
+
+def _stated_anew(
+    board: BoardPoints | None, truth: Estimate, rng: np.random.Generator
+) -> BoardPoints | None:
+    """The board with a size and bends stated of it that err by their sigmas from the truth."""
+    if board is None or truth.board_shape is None:
+        return board
+    sigma = board.board.shape_sigma
+    mean = truth.board_shape + sigma * rng.standard_normal(len(sigma))
+    return replace(board, board=replace(board.board, shape_mean=mean))
 
 
 def _judge(

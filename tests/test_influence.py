@@ -108,4 +108,4 @@ def test_shared_errors_are_those_of_dense_algebra(
     of_track = np.bincount(seen.point, sigma**-2)[seen.point]
     left = np.maximum(1 - 1.5 * sigma**-2 / of_track, LEAST_REDUNDANCY)
     expected = ((moved**2).sum(1) / left).sum()
-    assert ours.before_fit == pytest.approx(expected, rel=1e-5)
+    assert np.trace(ours.before_fit) == pytest.approx(expected, rel=1e-5)

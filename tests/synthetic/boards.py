@@ -1,0 +1,89 @@
+"""Problems with a board: seen by a rig that it is waved before, or standing in a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphs.boards import corners_of
+from graphs.camera import Camera, nominal_params, project
+from graphs.frames import FloatArray, Transform
+from graphs.problem import Board, BoardPoints, Estimate, Observations, Problem
+
+COLUMNS, ROWS, SQUARE_M = 8, 6, 0.03
+
+
+def flat_board(sigma: Sequence[float] = (1e-3, 0.0, 0.0)) -> Board:
+    """8 x 6 corners 30 mm apart; sigma (3,) of its size and its bends."""
+    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
+    corners = SQUARE_M * np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    return Board(corners, np.zeros(3), np.array(sigma))
+
+
+def camera(name: str, lens: str = "radtan", focal_px: float = 600.0) -> Camera:
+    params = nominal_params(lens, (640, 480), focal_px)  # type: ignore[arg-type]
+    params[2:4] += [6.0, -4.0]
+    if lens == "radtan":
+        params[4:8] = [-0.12, 0.05, 0.0005, -0.0008]
+    return Camera(name, lens, (640, 480), params)  # type: ignore[arg-type]
+
+
+def stereo(lens: str = "radtan") -> tuple[tuple[Camera, ...], tuple[Transform, ...]]:
+    """Two cameras 12 cm apart that look the same way but for a few degrees."""
+    turned = Transform.exp(np.array([0.01, -0.08, 0.02]), np.array([-0.12, 0.004, 0.003]))
+    return (camera("left", lens), camera("right", lens, 640.0)), (Transform.identity(), turned)
+
+
+def waved(
+    rng: np.random.Generator,
+    n_frames: int = 12,
+    noise_px: float = 0.1,
+    cameras: Sequence[Camera] | None = None,
+    cam_from_rig: Sequence[Transform] | None = None,
+    board: Board | None = None,
+    shape: Sequence[float] = (0.0, 0.0, 0.0),
+    seen: float = 1.0,
+) -> tuple[Problem, Estimate]:
+    """A board before a rig, in another place each frame, and the truth.
+
+    shape (3,): its true one; seen: share of the corners that each image has.
+    """
+    if cameras is None or cam_from_rig is None:
+        cameras, cam_from_rig = stereo()
+    board = board or flat_board()
+    true_corners = corners_of(board, np.array(shape))[0]
+    rig_from_board = tuple(_before_the_rig(rng, true_corners.mean(0)) for _ in range(n_frames))
+    n = len(true_corners)
+    points = np.tile(true_corners, (n_frames, 1))
+    truth = Estimate(
+        tuple(cameras), tuple(cam_from_rig), rig_from_board, points, None, np.array(shape)
+    )
+    pixels, frames, owners, which = [], [], [], []
+    for frame, placed in enumerate(rig_from_board):
+        for index, (lens, to_camera) in enumerate(zip(cameras, cam_from_rig, strict=True)):
+            at = project(lens, to_camera @ (placed @ true_corners))
+            inside = ((at > 0) & (at < np.array(lens.size) - 1)).all(1)
+            corner = np.flatnonzero(inside & (rng.uniform(size=n) < seen))
+            pixels.append(at[corner] + noise_px * rng.standard_normal((len(corner), 2)))
+            frames.append(np.full(len(corner), frame))
+            owners.append(np.full(len(corner), index))
+            which.append(frame * n + corner)
+    observations = Observations(
+        np.concatenate(pixels), np.concatenate(frames), np.concatenate(owners),
+        np.concatenate(which),
+    )  # fmt: skip
+    of_board = BoardPoints(
+        board, np.tile(np.arange(n), n_frames), np.zeros(n * n_frames, dtype=bool)
+    )
+    names = tuple(f"board{frame:03d}" for frame in range(n_frames))
+    start = replace(truth, board_shape=board.shape_mean)
+    return Problem(start, observations, names, 0, board=of_board), truth
+
+
+def _before_the_rig(rng: np.random.Generator, middle: FloatArray) -> Transform:
+    """rig_from_board somewhere in view, tilted by up to 40 degrees."""
+    turn = Transform.exp(rng.uniform(-0.7, 0.7, 3) * [1, 1, 2], np.zeros(3)).rotation
+    place = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.08, 0.08), rng.uniform(0.35, 0.7)])
+    return Transform(turn, place - turn @ middle)
