@@ -77,8 +77,8 @@ def build(
         others.add(rig_prior_factor(index, rig_prior))
     add_gauge(others, problem)
     noise = root_information(problem, options)
-    if problem.scale is not None:
-        others.add(scale_factor(problem, noise, lens_of, options.loss, options.loss_scale))
+    for source in problem.scales:
+        others.add(scale_factor(problem, source, noise, lens_of, options.loss, options.loss_scale))
     initial = initial_values(problem, lens_of)
     if extra is not None:
         _check_soft(extra)

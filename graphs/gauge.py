@@ -49,7 +49,7 @@ def choose_gauge(problem: Problem) -> Gauge:
 def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     """Hold seven degrees of freedom and the reference camera.
 
-    With a scale source, whose factor `graphs.scale` makes, only six: the size is not held.
+    With scale sources, whose factors `graphs.scale` makes, only six: the size is not held.
     """
     gauge = choose_gauge(problem)
     sigma = GAUGE_SIGMA * gauge.distance
@@ -57,7 +57,7 @@ def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     pose = to_gtsam_inverse(problem.initial.rig_from_world[gauge.frame])
     graph.add(gtsam.PriorFactorPose3(frame_key(gauge.frame), pose, held))
     graph.add(hold_reference(problem, gauge))
-    if problem.scale is not None:
+    if problem.scales:
         return
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
     pair = gauge.frames or gauge.cameras

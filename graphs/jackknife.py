@@ -106,7 +106,7 @@ def solve_part(
 ) -> tuple[FloatArray, ModelCovariance] | None:
     """How far the calibration (n,) moves with these frames (n_frames,) alone, and its covariance.
 
-    Both in the unit of `model`. Frames that give the unit stay: the ends of a measured path, and
+    Both in the unit of `model`. Frames that give the unit stay: the ends of measured paths, and
     all with clicks. None where these frames do not determine the calibration.
     """
     problem = graph.problem
@@ -144,13 +144,14 @@ def tangent(in_unit: Estimate, model: ModelCovariance) -> FloatArray:
 
 
 def _of_scale(problem: Problem) -> IntArray:
-    """Frames without which a measured distance gives no unit: of a path's ends, of clicks."""
-    scale, seen = problem.scale, problem.observations
-    if isinstance(scale, KnownPath):
-        return np.array(scale.frames)
-    if isinstance(scale, KnownSpan):
-        return np.unique(seen.frame[np.isin(seen.point, scale.points)])
-    return np.empty(0, np.int64)
+    """Frames without which measured distances give no unit: of paths' ends, of clicks."""
+    seen, kept = problem.observations, [np.empty(0, np.int64)]
+    for source in problem.scales:
+        if isinstance(source, KnownPath):
+            kept.append(np.array(source.frames))
+        elif isinstance(source, KnownSpan):
+            kept.append(seen.frame[np.isin(seen.point, source.points)])
+    return np.unique(np.concatenate(kept))
 
 
 def change(estimate: Estimate, other: Estimate, names: tuple[str, ...]) -> FloatArray:

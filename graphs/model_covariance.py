@@ -40,7 +40,7 @@ class ModelCovariance:
 
     @property
     def from_priors(self) -> FloatArray:
-        """The covariance (n, n) that priors and the scale source bring by being uncertain."""
+        """The covariance (n, n) that priors and scale sources bring by being uncertain."""
         result: FloatArray = self.of_priors.T @ self.of_priors
         return result
 
@@ -86,7 +86,7 @@ def model_covariance(
         response = responses(graph, system, columns)
     by_tangent, unit = to_reported, 1.0
     unit_camera = None if like is None else like.unit_camera
-    if graph.problem.scale is None and like is None:
+    if not graph.problem.scales and like is None:
         whole = Covariance(names, to_reported @ response[columns] @ to_reported.T)
         unit_camera = baseline_unit(estimate, graph.problem.reference, whole)
     if unit_camera is not None:

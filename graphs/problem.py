@@ -87,7 +87,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class KnownBaseline:
-    """A measured distance between two cameras of the rig: the scale of a metric result."""
+    """A measured distance between two cameras of the rig: a source of metric scale."""
 
     cameras: tuple[int, int]
     length_m: float
@@ -124,7 +124,7 @@ class Problem:
     observations: Observations
     frame_names: tuple[str, ...]
     reference: int = 0  # index of the camera whose frame is the rig's frame
-    scale: ScaleSource | None = None
+    scales: tuple[ScaleSource, ...] = ()  # measured distances; none: the size is free
 
 
 def points_in_cameras(estimate: Estimate, observations: Observations) -> FloatArray:

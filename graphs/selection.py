@@ -44,7 +44,7 @@ def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
 def compact(problem: Problem, observations: Observations) -> Problem:
     """The problem with these observations, and only the frames and points they see.
 
-    Raises ValueError when an end of the measured distance goes with the rest.
+    Raises ValueError when an end of a measured distance goes with the rest.
     """
     start = problem.initial
     points, point = np.unique(observations.point, return_inverse=True)
@@ -59,13 +59,14 @@ def compact(problem: Problem, observations: Observations) -> Problem:
         ),
         observations=replace(observations, point=point, frame=frame),
         frame_names=tuple(problem.frame_names[f] for f in frames),
-        scale=_renumbered(problem, frames, points),
+        scales=tuple(_renumbered(problem, one, frames, points) for one in problem.scales),
     )
 
 
-def _renumbered(problem: Problem, frames: IntArray, points: IntArray) -> ScaleSource | None:
-    """The problem's scale source once only these frames and points are left."""
-    scale = problem.scale
+def _renumbered(
+    problem: Problem, scale: ScaleSource, frames: IntArray, points: IntArray
+) -> ScaleSource:
+    """A scale source of the problem once only these frames and points are left."""
     if isinstance(scale, KnownPath):
         if not np.isin(scale.frames, frames).all():
             names = " and ".join(problem.frame_names[f] for f in scale.frames)
