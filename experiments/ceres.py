@@ -119,7 +119,7 @@ def trace_of(table: str, final_cost: float) -> list[tuple[float, float]]:
 
 
 def _check_exact(problem: Problem, options: GraphOptions) -> None:
-    if problem.scale is not None:
+    if problem.scales:
         raise ValueError("COLMAP has no measured baselines: give a problem without one")
     for camera in problem.initial.cameras:
         if camera.lens not in EXACT_LENSES:

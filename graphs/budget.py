@@ -45,7 +45,7 @@ def within_budget(
 ) -> tuple[Problem, Budget | None]:
     """The problem with at most `max_observations`, and what that costs; None: it has no more.
 
-    Ties keep their order: the result is the same every time. The two ends of a measured distance
+    Ties keep their order: the result is the same every time. The two ends of each measured distance
     are kept beyond the number.
     Raises ValueError when the problem, or what is left of it, determines too little.
     """
@@ -59,8 +59,9 @@ def within_budget(
     by_worth = np.argsort(-worth, kind="stable")
     keep = _spread_over_images(problem, length, by_worth, max_observations)
     keep |= problem.known
-    if isinstance(problem.scale, KnownSpan):
-        keep[list(problem.scale.points)] = True
+    for source in problem.scales:
+        if isinstance(source, KnownSpan):
+            keep[list(source.points)] = True
     chosen = compact(problem, seen.subset(keep[seen.point]))
     factor = _information(chosen, options)[0] / sigma if sigma.size else np.ones(1)
     budget = Budget(

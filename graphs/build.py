@@ -80,8 +80,8 @@ def build(
     noise = root_information(problem, options)
     if problem.board is not None:
         others.add(shape_prior_factor(problem.board.board))
-    if problem.scale is not None:
-        others.add(scale_factor(problem, noise, lens_of, options.loss, options.loss_scale))
+    for source in problem.scales:
+        others.add(scale_factor(problem, source, noise, lens_of, options.loss, options.loss_scale))
     initial = initial_values(problem, lens_of)
     if extra is not None:
         _check_soft(extra)

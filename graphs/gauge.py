@@ -54,7 +54,7 @@ def choose_gauge(problem: Problem) -> Gauge | None:
 def add_gauge(graph: gtsam.NonlinearFactorGraph, problem: Problem) -> None:
     """Hold seven degrees of freedom and the reference camera.
 
-    With a source of scale, a measured distance or a board, only six: the size is not held.
+    With sources of scale, measured distances or a board, only six: the size is not held.
     """
     gauge = choose_gauge(problem)
     graph.add(hold_reference(problem, gauge))

@@ -115,7 +115,7 @@ def solve_part(
 ) -> tuple[FloatArray, ModelCovariance] | None:
     """How far the calibration (n,) moves with these frames (n_frames,) alone, and its covariance.
 
-    Both in the unit of `model`. Frames that give the unit stay: the ends of a measured path, and
+    Both in the unit of `model`. Frames that give the unit stay: the ends of measured paths, and
     all with clicks. None where these frames do not determine the calibration.
     """
     problem = graph.problem
@@ -153,17 +153,18 @@ def tangent(in_unit: Estimate, model: ModelCovariance) -> FloatArray:
 
 
 def _of_scale(problem: Problem) -> IntArray:
-    """Frames without which nothing gives a unit: of a path's ends, of clicks, the one that sees a
+    """Frames without which nothing gives a unit: of paths' ends, of clicks, the one that sees a
     board."""
-    scale, seen = problem.scale, problem.observations
+    seen, kept = problem.observations, [np.empty(0, np.int64)]
+    for source in problem.scales:
+        if isinstance(source, KnownPath):
+            kept.append(np.array(source.frames))
+        elif isinstance(source, KnownSpan):
+            kept.append(seen.frame[np.isin(seen.point, source.points)])
     with_board = np.unique(seen.frame[problem.known[seen.point]])
-    if scale is None and len(with_board) == 1:
-        return with_board
-    if isinstance(scale, KnownPath):
-        return np.array(scale.frames)
-    if isinstance(scale, KnownSpan):
-        return np.unique(seen.frame[np.isin(seen.point, scale.points)])
-    return np.empty(0, np.int64)
+    if len(with_board) == 1:
+        kept.append(with_board)
+    return np.unique(np.concatenate(kept))
 
 
 def change(estimate: Estimate, other: Estimate, names: tuple[str, ...]) -> FloatArray:

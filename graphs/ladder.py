@@ -198,12 +198,12 @@ def on_rung_of(
 def thinned(problem: Problem, max_observations: int) -> Problem:
     """The problem with about so many observations, of tracks by lot, the same ones every time.
 
-    No frame is left with fewer than LEAST_IN_FRAME that had them. Of the measured scale only a
-    baseline is kept: no lens depends on it.
+    No frame is left with fewer than LEAST_IN_FRAME that had them. Of the measured scale only
+    baselines are kept: no lens depends on them.
     """
     seen = problem.observations
-    scale = problem.scale if isinstance(problem.scale, KnownBaseline) else None
-    problem = replace(problem, scale=scale)
+    baselines = tuple(one for one in problem.scales if isinstance(one, KnownBaseline))
+    problem = replace(problem, scales=baselines)
     if len(seen) <= max_observations:
         return problem
     length = np.bincount(seen.point, minlength=len(problem.initial.points))

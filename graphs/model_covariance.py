@@ -40,7 +40,7 @@ class ModelCovariance:
 
     @property
     def from_priors(self) -> FloatArray:
-        """The covariance (n, n) that priors and the scale source bring by being uncertain."""
+        """The covariance (n, n) that priors and scale sources bring by being uncertain."""
         result: FloatArray = self.of_priors.T @ self.of_priors
         return result
 

@@ -166,16 +166,22 @@ def _classes(problem: Problem, projected: NDArray[np.bool_]) -> Iterator[tuple[i
 
 
 def with_click_sigma(problem: Problem, sigma_px: float) -> Problem:
-    """The problem with the ends of a KnownSpan weighed by the sigma that is stated of them.
+    """The problem with the ends of each KnownSpan weighed by the sigma that is stated of them.
 
     sigma_px: of all other observations. Where it is larger it holds for clicks too: what it is
     made of, such as a lens that does not fit, spares none of them.
     """
-    scale, seen = problem.scale, problem.observations
-    if not isinstance(scale, KnownSpan) or scale.click_sigma_px is None:
+    seen = problem.observations
+    clicked = [
+        (source.points, source.click_sigma_px)
+        for source in problem.scales
+        if isinstance(source, KnownSpan) and source.click_sigma_px is not None
+    ]
+    if not clicked:
         return problem
     relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma.copy()
-    relative[np.isin(seen.point, scale.points)] = max(scale.click_sigma_px / sigma_px, 1.0)
+    for points, click_sigma_px in clicked:
+        relative[np.isin(seen.point, points)] = max(click_sigma_px / sigma_px, 1.0)
     return replace(problem, observations=replace(seen, relative_sigma=relative))
 
 

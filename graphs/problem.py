@@ -94,7 +94,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class KnownBaseline:
-    """A measured distance between two cameras of the rig: the scale of a metric result."""
+    """A measured distance between two cameras of the rig: a source of metric scale."""
 
     cameras: tuple[int, int]
     length_m: float
@@ -154,7 +154,7 @@ class Problem:
     observations: Observations
     frame_names: tuple[str, ...]
     reference: int = 0  # index of the camera whose frame is the rig's frame
-    scale: ScaleSource | None = None
+    scales: tuple[ScaleSource, ...] = ()  # measured distances
     board: BoardPoints | None = None
 
     @property
@@ -176,7 +176,7 @@ class Problem:
     @property
     def metric(self) -> bool:
         """Whether lengths of the rig are in metres: measured, or seen against a board."""
-        return self.scale is not None or self._board_gives_scale
+        return bool(self.scales) or self._board_gives_scale
 
     @property
     def _board_gives_scale(self) -> bool:

@@ -107,8 +107,8 @@ def build_reference(problem: Problem, options: GraphOptions) -> ReferenceGraph:
     for index, rig_prior in options.rig_priors.items():
         factors.add(rig_prior_factor(index, rig_prior))
     add_gauge(factors, problem)
-    if problem.scale is not None:
-        factors.add(native_scale_factor(problem.scale))
+    for source in problem.scales:
+        factors.add(native_scale_factor(source))
     return ReferenceGraph(problem, factors, native_values(problem))
 
 

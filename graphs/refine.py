@@ -121,15 +121,16 @@ def noise_of(problem: Problem, options: GraphOptions | None = None) -> float:
 def without_mismatches(problem: Problem, min_parallax_deg: float) -> Problem:
     """The problem less observations far beyond the noise, and the tracks that end with them.
 
-    Raises ValueError when that leaves too little of an end of the measured distance.
+    Raises ValueError when that leaves too little of an end of a measured distance.
     """
     sigma_px = noise_of(problem)
     problem = with_click_sigma(problem, sigma_px)
     sigmas = residual_lengths(problem, residuals(problem)) / sigma_px
     with np.errstate(invalid="ignore"):
         keep = (sigmas < REJECT_SIGMAS) & ~ends_in_a_camera(problem)
-    if isinstance(problem.scale, KnownSpan):
-        _check_ends(problem, problem.scale, keep, sigmas)
+    for source in problem.scales:
+        if isinstance(source, KnownSpan):
+            _check_ends(problem, source, keep, sigmas)
     return select_tracks(
         replace(problem, observations=problem.observations.subset(keep)), min_parallax_deg
     )

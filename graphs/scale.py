@@ -39,14 +39,13 @@ def length_of(scale: ScaleSource, estimate: Estimate) -> float:
 
 def scale_factor(
     problem: Problem,
+    scale: ScaleSource,
     root_information: FloatArray,
     lens_of: tuple[int, ...],
     loss: LossName,
     loss_scale: float,
 ) -> gtsam.NonlinearFactor:
-    """The problem's scale source as a factor; root_information (n_obs,) 1 / sigma of a pixel."""
-    scale = problem.scale
-    assert scale is not None
+    """A scale source of the problem as a factor; root_information (n_obs,) 1 / sigma of a pixel."""
     if not isinstance(scale, KnownSpan):
         return range_factor(scale)
     return _Span(problem, scale, root_information, lens_of, loss, loss_scale).factor()
@@ -54,15 +53,14 @@ def scale_factor(
 
 def total_sigma_m(
     problem: Problem,
+    scale: ScaleSource,
     root_information: FloatArray,
     lens_of: tuple[int, ...],
     loss: LossName,
     loss_scale: float,
     values: gtsam.Values,
 ) -> float:
-    """Sigma of the measured distance; between points, that of their own pixels included."""
-    scale = problem.scale
-    assert scale is not None
+    """Sigma of a measured distance; between points, that of their own pixels included."""
     if not isinstance(scale, KnownSpan):
         return scale.sigma_m
     span = _Span(problem, scale, root_information, lens_of, loss, loss_scale)
@@ -106,7 +104,7 @@ class _Span:
             problem,
             initial=ends,
             observations=replace(observations, point=point),
-            scale=None,
+            scales=(),
             board=None,
         )
         columns = track_columns(problem, lens_of)

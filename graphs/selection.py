@@ -59,7 +59,7 @@ def _in_enough_company(problem: Problem) -> BoolArray:
 def compact(problem: Problem, observations: Observations) -> Problem:
     """The problem with these observations, and only the frames and points they see.
 
-    Raises ValueError when an end of the measured distance goes with the rest.
+    Raises ValueError when an end of a measured distance goes with the rest.
     """
     start = problem.initial
     points, point = np.unique(observations.point, return_inverse=True)
@@ -73,7 +73,7 @@ def compact(problem: Problem, observations: Observations) -> Problem:
         ),
         observations=replace(observations, point=point, frame=frame),
         frame_names=tuple(problem.frame_names[f] for f in frames),
-        scale=_renumbered(problem, frames, points),
+        scales=tuple(_renumbered(problem, one, frames, points) for one in problem.scales),
         board=_board_of(problem, points),
     )
 
@@ -85,9 +85,10 @@ def _board_of(problem: Problem, points: IntArray) -> BoardPoints | None:
     return replace(board, corner=board.corner[points], still=board.still[points])
 
 
-def _renumbered(problem: Problem, frames: IntArray, points: IntArray) -> ScaleSource | None:
-    """The problem's scale source once only these frames and points are left."""
-    scale = problem.scale
+def _renumbered(
+    problem: Problem, scale: ScaleSource, frames: IntArray, points: IntArray
+) -> ScaleSource:
+    """A scale source of the problem once only these frames and points are left."""
     if isinstance(scale, KnownPath):
         if not np.isin(scale.frames, frames).all():
             names = " and ".join(problem.frame_names[f] for f in scale.frames)

@@ -84,8 +84,8 @@ def certify(
 def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
     """The optimum seen anew: exact projections, and lengths of noise drawn from the residuals'.
 
-    Directions are drawn evenly, each length is scaled by the sigma of its observation, and a
-    measured distance errs by its sigma.
+    Directions are drawn evenly, each length is scaled by the sigma of its observation, and
+    each measured distance errs by its sigma.
     """
     problem, estimate = refinement.problem, refinement.estimate
     seen = problem.observations
@@ -98,15 +98,15 @@ def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
     angle = rng.uniform(0, 2 * np.pi, len(seen))
     noise = drawn[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     exact = np.where(good[:, None], seen.pixels + left, seen.pixels)
-    scale = problem.scale
-    if scale is not None:
-        measured = length_of(scale, estimate) + scale.sigma_m * rng.standard_normal()
-        scale = replace(scale, length_m=measured)
+    scales = tuple(
+        replace(one, length_m=length_of(one, estimate) + one.sigma_m * rng.standard_normal())
+        for one in problem.scales
+    )
     return replace(
         problem,
         initial=estimate,
         observations=replace(seen, pixels=exact + noise),
-        scale=scale,
+        scales=scales,
         board=_stated_anew(problem.board, estimate, rng),
     )
 

@@ -15,8 +15,9 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
     field_validator,
-    model_validator,
 )
 
 from graphs.lenses import LensName
@@ -169,29 +170,37 @@ class PointsConfig(BaseModel):
 Measured = BaselineConfig | FramesConfig | PointsConfig
 
 
+def _one_or_several(model: type[BaseModel]) -> WrapValidator:
+    """One entry without a list around it is a list of one; errors name it without a number."""
+
+    def validate(given: object, several: ValidatorFunctionWrapHandler) -> object:
+        if given is None:
+            return ()
+        if isinstance(given, list | tuple):
+            return several(given)
+        return (model.model_validate(given),)
+
+    return WrapValidator(validate)
+
+
 class ScaleConfig(BaseModel):
-    """What gives the rig's lengths in metres: one measured distance at most."""
+    """What gives the rig's lengths in metres: measured distances, of each kind one or a list."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    baseline: BaselineConfig | None = None
-    frames: FramesConfig | None = None
-    points: PointsConfig | None = None
-
-    @model_validator(mode="after")
-    def _one_source(self) -> ScaleConfig:
-        given = [name for name in ScaleConfig.model_fields if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(
-                f"{len(given)} sources ({' and '.join(given)}) and one unit of length: keep the "
-                "distance that you measured best"
-            )
-        return self
+    baseline: Annotated[tuple[BaselineConfig, ...], _one_or_several(BaselineConfig)] = ()
+    frames: Annotated[tuple[FramesConfig, ...], _one_or_several(FramesConfig)] = ()
+    points: Annotated[tuple[PointsConfig, ...], _one_or_several(PointsConfig)] = ()
 
     @property
-    def measured(self) -> Measured | None:
-        """The one distance that is given."""
-        return self.baseline or self.frames or self.points
+    def measured(self) -> tuple[tuple[str, Measured], ...]:
+        """Every distance that is given, after its key: `scale.frames`, of several `.1`, `.2`."""
+        return tuple(
+            (f"scale.{kind}.{number}" if len(given) > 1 else f"scale.{kind}", one)
+            for kind in ScaleConfig.model_fields
+            for given in (getattr(self, kind),)
+            for number, one in enumerate(given)
+        )
 
 
 class RigConfig(Options):

@@ -205,7 +205,7 @@ def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, 
     Without a metric scale only the rotation can be believed.
     """
     names = [camera.name for camera in start.cameras]
-    metric = config.scale.measured is not None
+    metric = bool(config.scale.measured)
     priors = {}
     for index, transform in enumerate(nominal_transforms(config, names, reference)):
         said = camera_config(config, names[index]).cam_from_rig
@@ -220,7 +220,7 @@ def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, 
 
 
 def start_from_config(problem: Problem, config: RigConfig) -> Problem:
-    """The problem with held parameters at their values, in the unit of its scale source.
+    """The problem with held parameters at their values, in the unit of its scale sources.
 
     Raises CalibrationError as `with_scale`.
     """

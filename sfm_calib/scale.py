@@ -1,4 +1,4 @@
-"""What rig.yaml measures: checked against the scan, and as the problem's source of scale."""
+"""What rig.yaml measures: checked against the scan, and as the problem's sources of scale."""
 
 from __future__ import annotations
 
@@ -24,7 +24,14 @@ from graphs.problem import (
 )
 from graphs.refine import noise_of
 from graphs.scale import length_of
-from sfm_calib.config import BaselineConfig, ClickConfig, FramesConfig, PointsConfig, ScaleConfig
+from sfm_calib.config import (
+    BaselineConfig,
+    ClickConfig,
+    FramesConfig,
+    Measured,
+    PointsConfig,
+    ScaleConfig,
+)
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.images import Scan
 
@@ -39,17 +46,18 @@ MARKS = ("first", "second")
 
 def check_scale(scale: ScaleConfig, scan: Scan) -> None:
     """Raises CalibrationError where rig.yaml measures between things that the scan has not."""
-    measured = scale.measured
-    if isinstance(measured, BaselineConfig):
-        for name in measured.cameras:
-            _check_camera("scale.baseline.cameras", name, scan)
-        _check_apart("baseline", measured.cameras, "cameras")
-    elif isinstance(measured, FramesConfig):
-        for name in measured.between:
-            _check_frame("scale.frames.between", name, scan.frames)
-        _check_apart("distance", measured.between, "frames")
-    elif isinstance(measured, PointsConfig):
-        _check_clicks(measured, scan)
+    for key, measured in scale.measured:
+        if isinstance(measured, BaselineConfig):
+            for name in measured.cameras:
+                _check_camera(f"{key}.cameras", name, scan)
+            _check_apart("baseline", measured.cameras, "cameras")
+        elif isinstance(measured, FramesConfig):
+            for name in measured.between:
+                _check_frame(f"{key}.between", name, scan.frames)
+            _check_apart("distance", measured.between, "frames")
+        else:
+            _check_clicks(f"{key}.between", measured, scan)
+    _check_marks_differ(scale.points)
 
 
 def _check_camera(key: str, name: str, scan: Scan) -> None:
@@ -71,8 +79,20 @@ def _check_apart(what: str, ends: tuple[str, str], kind: str) -> None:
         )
 
 
-def _check_clicks(measured: PointsConfig, scan: Scan) -> None:
-    key = "scale.points.between"
+def _check_marks_differ(points: Sequence[PointsConfig]) -> None:
+    """A click counts once: the same one for two distances would be taken for two sightings."""
+    first: dict[ClickConfig, int] = {}
+    for number, measured in enumerate(points):
+        for click in (click for clicks in measured.between for click in clicks):
+            if first.setdefault(click, number) != number:
+                raise CalibrationError(
+                    f"scale.points.{number}.between: the click ({click.pixel[0]:g}, "
+                    f"{click.pixel[1]:g}) in {_image_of(click)} is one of "
+                    f"scale.points.{first[click]} already, and counts once; click marks of its own"
+                )
+
+
+def _check_clicks(key: str, measured: PointsConfig, scan: Scan) -> None:
     taken = {(scan.cameras[image.camera], scan.frames[image.frame]) for image in scan.images}
     for which, clicks in zip(MARKS, measured.between, strict=True):
         seen = set()
@@ -113,52 +133,71 @@ def _image_of(click: ClickConfig) -> str:
     return f"{click.camera}/{click.frame}"
 
 
-# ---- the problem's source -------------------------------------------------------------------
+# ---- the problem's sources ------------------------------------------------------------------
 
 
 def with_scale(problem: Problem, scale: ScaleConfig, min_parallax_deg: float) -> Problem:
-    """The problem with the measured distance as its source of scale, in metres from the start.
+    """The problem with the measured distances as its sources of scale, in metres from the start.
 
-    Raises CalibrationError when the mapping lost an end of it, when the clicks on a mark do not
+    Raises CalibrationError when the mapping lost an end of one, when the clicks on a mark do not
     meet, and when the ends are at one place.
     """
-    measured = scale.measured
-    if measured is None:
+    sources: list[ScaleSource] = []
+    for key, measured in scale.measured:
+        problem, source = _with_source(problem, f"{key}.", measured, min_parallax_deg)
+        sources.append(source)
+    if not sources:
         return problem
-    length, sigma = measured.length_m, measured.sigma_m
-    source: ScaleSource
-    if isinstance(measured, BaselineConfig):
-        names = [camera.name for camera in problem.initial.cameras]
-        a, b = (names.index(name) for name in measured.cameras)
-        source = KnownBaseline((a, b), length, sigma)
-    elif isinstance(measured, FramesConfig):
-        a, b = (_placed("scale.frames.between", name, problem) for name in measured.between)
-        source = KnownPath((a, b), length, sigma)
-    else:
-        a = len(problem.initial.points)
-        for which, clicks in zip(MARKS, measured.between, strict=True):
-            seen = _clicks_seen(problem, clicks)
-            problem = _with_mark(problem, seen, which, measured.click_sigma_px, min_parallax_deg)
-        source = KnownSpan((a, a + 1), length, sigma, measured.click_sigma_px)
-    now = length_of(source, problem.initial)
-    if now <= 0:
-        raise CalibrationError(
-            f"the scan puts both ends of the {in_words(source, problem)}, at one place: measure "
-            "between others"
-        )
-    problem = replace(problem, initial=problem.initial.scaled(length / now), scale=source)
+    problem = replace(problem, scales=tuple(sources))
+    for source in sources:
+        if length_of(source, problem.initial) <= 0:
+            raise CalibrationError(
+                f"the scan puts both ends of the {in_words(source, problem)}, at one place: "
+                "measure between others"
+            )
+    best = min(sources, key=lambda source: source.sigma_m / source.length_m)
+    size = best.length_m / length_of(best, problem.initial)
+    problem = replace(problem, initial=problem.initial.scaled(size))
     return with_click_sigma(problem, noise_of(problem))
 
 
+def _with_source(
+    problem: Problem, key: str, measured: Measured, min_parallax_deg: float
+) -> tuple[Problem, ScaleSource]:
+    """A measured distance in the words of the maths, and the problem with the marks it needs."""
+    length, sigma = measured.length_m, measured.sigma_m
+    if isinstance(measured, BaselineConfig):
+        names = [camera.name for camera in problem.initial.cameras]
+        a, b = (names.index(name) for name in measured.cameras)
+        return problem, KnownBaseline((a, b), length, sigma)
+    key += "between"
+    if isinstance(measured, FramesConfig):
+        a, b = (_placed(key, name, problem) for name in measured.between)
+        return problem, KnownPath((a, b), length, sigma)
+    a = len(problem.initial.points)
+    for which, clicks in zip(MARKS, measured.between, strict=True):
+        seen = _clicks_seen(key, problem, clicks)
+        of_mark = f"{key}: the clicks on the {which} mark"
+        problem = _with_mark(problem, seen, of_mark, measured.click_sigma_px, min_parallax_deg)
+    return problem, KnownSpan((a, a + 1), length, sigma, measured.click_sigma_px)
+
+
 def in_words(scale: ScaleSource, problem: Problem) -> str:
-    """What a source of scale measures, for the result and its readers."""
+    """What a source of scale measures, and the measure, for the result and its readers."""
+    return f"{name_of(scale, problem)}: {scale.length_m:g} m"
+
+
+def name_of(scale: ScaleSource, problem: Problem) -> str:
+    """What a source of scale measures."""
     if isinstance(scale, KnownBaseline):
         a, b = (problem.initial.cameras[i].name for i in scale.cameras)
-        return f"baseline {a} to {b}: {scale.length_m:g} m"
+        return f"baseline {a} to {b}"
     if isinstance(scale, KnownPath):
         a, b = (problem.frame_names[i] for i in scale.frames)
-        return f"distance from frame {a} to frame {b}: {scale.length_m:g} m"
-    return f"distance between two clicked marks: {scale.length_m:g} m"
+        return f"distance from frame {a} to frame {b}"
+    spans = [one for one in problem.scales if isinstance(one, KnownSpan)]
+    which = f" (scale.points.{spans.index(scale)})" if len(spans) > 1 else ""
+    return f"distance between two clicked marks{which}"
 
 
 def _placed(key: str, name: str, problem: Problem) -> int:
@@ -171,12 +210,12 @@ def _placed(key: str, name: str, problem: Problem) -> int:
     return problem.frame_names.index(name)
 
 
-def _clicks_seen(problem: Problem, clicks: Sequence[ClickConfig]) -> Observations:
+def _clicks_seen(key: str, problem: Problem, clicks: Sequence[ClickConfig]) -> Observations:
     """Clicks on one mark as observations of the point that comes after all others.
 
     Raises CalibrationError where the mapping lost an image, or its lens sees nothing there.
     """
-    key, seen = "scale.points.between", problem.observations
+    seen = problem.observations
     cameras = [camera.name for camera in problem.initial.cameras]
     frame = np.array([_placed(key, click.frame, problem) for click in clicks])
     camera = np.array([cameras.index(click.camera) for click in clicks])
@@ -199,7 +238,7 @@ def _clicks_seen(problem: Problem, clicks: Sequence[ClickConfig]) -> Observation
 def _with_mark(
     problem: Problem,
     clicks: Observations,
-    which: str,
+    key: str,
     click_sigma_px: float,
     min_parallax_deg: float,
 ) -> Problem:
@@ -208,7 +247,6 @@ def _with_mark(
     Raises CalibrationError where they are nearly parallel, or do not meet.
     """
     start, seen = problem.initial, problem.observations
-    key = f"scale.points.between: the clicks on the {which} mark"
     place, parallax_deg = _meeting_point(start, clicks)
     if not parallax_deg >= min_parallax_deg:
         raise CalibrationError(

@@ -152,7 +152,7 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
 
 
 def _unit_name(run: Run) -> Literal["m", "baseline"] | None:
-    if run.refinement.problem.scale is not None:
+    if run.refinement.problem.scales:
         return "m" if len(run.scan.cameras) > 1 else None
     return None if run.covariance.basis.unit_camera is None else "baseline"
 
@@ -172,10 +172,8 @@ def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) 
         )
     reference = names[problem.reference]
     scale = result.Scale(source="none: one camera has no length")
-    if problem.scale is not None:
-        scale = result.Scale(
-            source=in_words(problem.scale, problem), sigma_relative=_scale_sigma(run)
-        )
+    if problem.scales:
+        scale = _scale(run)
     elif far is not None:
         scale = result.Scale(source=f"none: unit is the baseline {reference} to {names[far]}")
     elif len(names) > 1:
@@ -183,25 +181,34 @@ def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) 
     return result.RigResult(
         reference=reference,
         cam_from_rig=transforms,
-        metric=problem.scale is not None,
+        metric=bool(problem.scales),
         scale=scale,
     )
 
 
-def _scale_sigma(run: Run) -> float:
-    """Relative sigma of the measured distance at the optimum, its clicks' own included."""
+def _scale(run: Run) -> result.Scale:
+    """The sources, and the relative sigma of what they measure together, clicks' own included."""
     graph = run.refinement.graph
-    scale, options = graph.problem.scale, graph.options
-    assert scale is not None
-    sigma_m = total_sigma_m(
-        graph.problem,
-        root_information(graph.problem, options),
-        graph.layout.lens_of,
-        options.loss,
-        options.loss_scale,
-        run.refinement.values,
+    problem, options = graph.problem, graph.options
+    sigmas = [
+        total_sigma_m(
+            problem,
+            source,
+            root_information(problem, options),
+            graph.layout.lens_of,
+            options.loss,
+            options.loss_scale,
+            run.refinement.values,
+        )
+        / source.length_m
+        for source in problem.scales
+    ]
+    best = in_words(problem.scales[int(np.argmin(sigmas))], problem)
+    others = len(sigmas) - 1
+    return result.Scale(
+        source=f"{best}, and {others} more" if others else best,
+        sigma_relative=sum(sigma**-2 for sigma in sigmas) ** -0.5,
     )
-    return sigma_m / scale.length_m
 
 
 def _solve(run: Run) -> result.Solve:

@@ -13,6 +13,7 @@ from graphs.problem import KnownSpan, Problem, images_seen
 from graphs.remedies import listed_parameters
 from graphs.twin import Certificate, worst
 from sfm_calib import nominal, result
+from sfm_calib.config import PointsConfig
 from sfm_calib.mapping import some
 from sfm_calib.run import Run
 
@@ -191,25 +192,28 @@ def _contradictions(run: Run) -> list[str]:
             else:
                 continue
             found.append(what)
-    scale = run.refinement.problem.scale
-    if scale is not None and scale.sigma_m > LOOSE_SCALE * scale.length_m:
+    loose = [one.sigma_m / one.length_m for one in run.refinement.problem.scales]
+    if loose and min(loose) > LOOSE_SCALE:
+        best = "the measured distance" if len(loose) == 1 else "the best measured distance"
         found.append(
-            f"the measured distance is known to {scale.sigma_m / scale.length_m:.0%} only, and "
-            "with it every length: measure it better"
+            f"{best} is known to {min(loose):.0%} only, and with it every length: measure it better"
         )
     return found
 
 
 def _lost_clicks(run: Run) -> list[str]:
     """Clicks on marks that were set aside as mismatches."""
-    said, problem = run.config.scale.points, run.refinement.problem
-    if said is None or not isinstance(problem.scale, KnownSpan):
-        return []
-    given = sum(map(len, said.between))
-    left = int(np.isin(problem.observations.point, problem.scale.points).sum())
-    if left == given:
-        return []
-    return [
-        f"{given - left} of {given} clicks on the marks of scale.points contradict the others and "
-        "were set aside: look at them again"
-    ]
+    problem = run.refinement.problem
+    spans = [source for source in problem.scales if isinstance(source, KnownSpan)]
+    said = [pair for pair in run.config.scale.measured if isinstance(pair[1], PointsConfig)]
+    found = []
+    for (key, measured), span in zip(said, spans, strict=False):  # none, where a study gives them
+        assert isinstance(measured, PointsConfig)
+        given = sum(map(len, measured.between))
+        left = int(np.isin(problem.observations.point, span.points).sum())
+        if left < given:
+            found.append(
+                f"{given - left} of {given} clicks on the marks of {key} contradict the others "
+                "and were set aside: look at them again"
+            )
+    return found

@@ -215,7 +215,7 @@ def test_too_much_thinning_is_refused(problem: Problem) -> None:
 
 
 def test_what_colmap_cannot_state_is_refused(problem: Problem) -> None:
-    measured = replace(problem, scale=KnownBaseline((0, 1), 0.2, 0.001))
+    measured = replace(problem, scales=(KnownBaseline((0, 1), 0.2, 0.001),))
     with pytest.raises(ValueError, match="baselines"):
         ceres_bundle_adjust(measured, GraphOptions(), 1e-9)
     options = TrackOptions(lens="radial", frames=4, points=200, baseline_sigma_m=0)

@@ -114,14 +114,15 @@ def test_the_ends_of_a_measured_distance_are_kept() -> None:
     gone = [i for i, p in enumerate(map(tuple, problem.initial.points)) if p not in left]
     a, b = gone[0], gone[-1]
     length_m = float(np.linalg.norm(problem.initial.points[b] - problem.initial.points[a]))
-    known = replace(problem, scale=KnownSpan((a, b), length_m, 0.01))
+    known = replace(problem, scales=(KnownSpan((a, b), length_m, 0.01),))
     kept, budget = within_budget(known, OPTIONS, int(0.3 * len(problem.observations)))
-    assert isinstance(kept.scale, KnownSpan) and budget is not None
+    (span,) = kept.scales
+    assert isinstance(span, KnownSpan) and budget is not None
     np.testing.assert_array_equal(
-        kept.initial.points[list(kept.scale.points)], problem.initial.points[[a, b]]
+        kept.initial.points[list(span.points)], problem.initial.points[[a, b]]
     )
     own = np.isin(problem.observations.point, (a, b)).sum()
-    assert np.isin(kept.observations.point, kept.scale.points).sum() == own
+    assert np.isin(kept.observations.point, span.points).sum() == own
 
 
 # ---- what it costs -------------------------------------------------------------------------

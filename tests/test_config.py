@@ -30,6 +30,12 @@ GOOD = {
         "click_sigma_px: 2.5}}"
     ),
     "no scale": "scale: {}",
+    "empty scales": "scale: {baseline: , frames: []}",
+    "several scales": (
+        "scale: {baseline: {cameras: [a, b], length_m: 1, sigma_m: 1}, frames: ["
+        "{between: ['1', '2'], length_m: 1, sigma_m: 1}, "
+        "{between: ['2', '3'], length_m: 1, sigma_m: 1}]}"
+    ),
     **{f"the loss {name}": f"loss: {name}" for name in get_args(LossChoice)},
 }
 BAD = {
@@ -61,11 +67,23 @@ BAD = {
         "sigma_m: 1}}",
         "'scale.points.between.1.0.pixels': did you mean 'pixel'? Valid here: camera, frame, pixel",
     ),
-    "two scales": (
-        "scale: {baseline: {cameras: [a, b], length_m: 1, sigma_m: 1}, "
-        "frames: {between: ['1', '2'], length_m: 1, sigma_m: 1}}",
-        "scale: 2 sources (baseline and frames) and one unit of length: keep the distance that you",
+    "the second of several paths": (
+        "scale: {frames: [{between: ['1', '2'], length_m: 1, sigma_m: 1}, "
+        "{between: ['2', '3'], length_m: 1, sigma_m: 0}]}",
+        "scale.frames.1.sigma_m: Input should be greater than 0 (got 0)",
     ),
+    "unknown key of the second of several paths": (
+        "scale: {frames: [{between: ['1', '2'], length_m: 1, sigma_m: 1}, "
+        "{between: ['2', '3'], length: 1, sigma_m: 1}]}",
+        "unknown key 'scale.frames.1.length': did you mean 'length_m'? Valid here: between, len",
+    ),
+    "unknown key of a click of several": (
+        f"scale: {{points: [{{between: [{MARK}, {MARK.replace('pixel', 'pixels')}], length_m: 1, "
+        "sigma_m: 1}]}",
+        "'scale.points.0.between.1.0.pixels': did you mean 'pixel'? Valid here: camera, frame, pix",
+    ),
+    "a number for a baseline": ("scale: {baseline: 0.2}", "scale.baseline: Input should be a "),
+    "a number among baselines": ("scale: {baseline: [0.2]}", "scale.baseline.0: Input should be"),
     "a path of no length": (
         "scale: {frames: {between: ['1', '2'], length_m: 0, sigma_m: 1}}",
         "scale.frames.length_m: Input should be greater than 0 (got 0)",

@@ -66,10 +66,10 @@ def test_example_shows_every_key(example: RigConfig) -> None:
             shown |= camera.cam_from_rig.model_fields_set
     for scale in shown_scales():
         shown |= scale.model_fields_set
-        assert scale.measured is not None
-        shown |= scale.measured.model_fields_set
-        if scale.points is not None:
-            shown |= scale.points.between[0][0].model_fields_set
+        ((_, measured),) = scale.measured
+        shown |= measured.model_fields_set
+        if isinstance(measured, PointsConfig):
+            shown |= measured.between[0][0].model_fields_set
     models: list[type[BaseModel]] = [RigConfig, CameraConfig, CamFromRigConfig, ScaleConfig]
     models += [BaselineConfig, FramesConfig, PointsConfig, ClickConfig]
     assert shown == {name for model in models for name in model.model_fields}

@@ -101,7 +101,7 @@ def test_the_sigma_of_the_baseline_is_that_of_its_measurement() -> None:
     problem = problem_of(baseline_sigma_m=0.0)
     at = {}
     for sigma_m in (1e-4, 0.01):
-        known = replace(problem, scale=KnownBaseline((0, 1), 0.2, sigma_m))
+        known = replace(problem, scales=(KnownBaseline((0, 1), 0.2, sigma_m),))
         estimate, covariance = solved(known)
         places = [covariance.model.names.index(f"cam1.translation_{axis}") for axis in "xyz"]
         of_translation = covariance.model.matrix[np.ix_(places, places)]
@@ -121,8 +121,8 @@ def test_the_covariance_scales_with_the_unit(metric: bool) -> None:
     problem = problem_of(baseline_sigma_m=0.0)
     mm = replace(problem, initial=problem.initial.scaled(1000.0))
     if metric:
-        problem = replace(problem, scale=KnownBaseline((0, 1), 0.2, 0.001))
-        mm = replace(mm, scale=KnownBaseline((0, 1), 200.0, 1.0))
+        problem = replace(problem, scales=(KnownBaseline((0, 1), 0.2, 0.001),))
+        mm = replace(mm, scales=(KnownBaseline((0, 1), 200.0, 1.0),))
     ours, theirs = solved(problem)[1].stated, solved(mm)[1].stated
     for name, sigma in ours.sigma.items():
         factor = 1000.0 if metric and ".translation_" in name else 1.0
@@ -291,7 +291,7 @@ def test_a_direction_that_a_prior_alone_decides_is_not_widened() -> None:
     disagree, its sigma stays, and it does not make others wide."""
     problem = problem_of(baseline_sigma_m=0.0)
     wrong = sheared(problem, 0.006, 0)
-    known = replace(wrong, scale=KnownBaseline((0, 1), 0.2, 0.0005))
+    known = replace(wrong, scales=(KnownBaseline((0, 1), 0.2, 0.0005),))
     _, without = solved(wrong)
     estimate, metric = solved(known)
     assert metric.inflation == pytest.approx(without.inflation, rel=0.05)

@@ -26,7 +26,7 @@ def test_a_baseline_has_the_sigma_of_its_measurement_however_long_the_path(sigma
     problem, _ = small_problem("radial", cameras=2)
     measured = KnownBaseline((0, 1), 0.2, sigma_m)
     factor = 0.2 / length_of(measured, problem.initial)
-    problem = replace(problem, initial=problem.initial.scaled(factor), scale=measured)
+    problem = replace(problem, initial=problem.initial.scaled(factor), scales=(measured,))
     graph = build(problem, OPTIONS)
     estimate, values, _ = solve(graph)
     model = calibration_covariance(graph, estimate, values).model

@@ -28,7 +28,7 @@ SMALL = TrackOptions(
 
 def problem_of(scale: KnownBaseline | None = None, **changes: object) -> Problem:
     problem, _ = simulate_tracks(SMALL.model_copy(update=changes), np.random.default_rng(0))
-    return replace(problem, scale=scale)
+    return replace(problem, scales=(scale,) if scale else ())
 
 
 def nullity(hessian: FloatArray) -> int:

@@ -158,7 +158,7 @@ def test_the_ends_of_a_measured_path_stay() -> None:
     problem = problem_of()
     places = [t.inverse.translation for t in problem.initial.rig_from_world]
     length = float(np.linalg.norm(places[15] - places[3]))
-    known = replace(problem, scale=KnownPath((3, 15), length, 0.01 * length))
+    known = replace(problem, scales=(KnownPath((3, 15), length, 0.01 * length),))
     found, _ = jackknifed(known)
     assert found.failed == ()
     place = found.names.index("cam1.translation_x")

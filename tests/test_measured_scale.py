@@ -146,7 +146,7 @@ def test_clicks_are_two_tracks_more_in_metres(
 ) -> None:
     problem, _ = mapped
     started = start_of(problem, points)
-    n, source = len(problem.initial.points), started.scale
+    n, (source,) = len(problem.initial.points), started.scales
     assert isinstance(source, KnownSpan) and source.points == (n, n + 1)
     assert source.click_sigma_px == 1.0
     assert length_of(source, started.initial) == pytest.approx(source.length_m)

@@ -112,7 +112,7 @@ def test_redundancy_counts_every_unknown() -> None:
     unknowns = 2 * 6 + 6 + 6 * len(problem.frame_names) + 3 * len(problem.initial.points) - 7
     measured = 2 * len(problem.observations)
     assert redundancy(problem) == pytest.approx(1 - unknowns / measured)
-    known = replace(problem, scale=KnownBaseline((0, 1), 1.0, 0.1))
+    known = replace(problem, scales=(KnownBaseline((0, 1), 1.0, 0.1),))
     assert redundancy(known) == pytest.approx(1 - (unknowns + 1) / measured)
 
 

@@ -172,7 +172,7 @@ def test_progress_counts_the_iterations_of_all_rounds() -> None:
 def test_a_camera_that_sees_nothing_is_named() -> None:
     problem, _ = simulate_tracks(TRACKS, np.random.default_rng(0))
     first_only = problem.observations.subset(problem.observations.camera == 0)
-    blind = replace(problem, observations=first_only, scale=None)
+    blind = replace(problem, observations=first_only, scales=())
     with pytest.raises(ValueError, match="cam1 sees none of the"):
         refine(blind, GraphOptions(), MIN_PARALLAX_DEG, NO_BUDGET)
 

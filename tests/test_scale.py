@@ -62,7 +62,7 @@ def measured(
     """A small problem whose start is in the unit of the measured distance, and its truth."""
     problem, true = small_problem(lens, sigma_px=sigma_px, start_error=0.3, seed=seed)
     scaled = problem.initial.scaled(source.length_m / length_of(source, problem.initial))
-    problem = replace(problem, initial=scaled, scale=source)
+    problem = replace(problem, initial=scaled, scales=(source,))
     true = true.scaled(source.length_m / length_of(source, true))
     return with_click_sigma(problem, SIGMA_PX), true
 
@@ -87,8 +87,8 @@ def reference_of(problem: Problem, options: GraphOptions) -> ReferenceGraph:
     for index, camera in enumerate(problem.initial.cameras):
         factors.add(native_prior_factor(index, camera, weak_lens_prior(camera)))
     add_gauge(factors, problem)
-    assert problem.scale is not None
-    factors.add(native_scale_factor(problem.scale))
+    for source in problem.scales:
+        factors.add(native_scale_factor(source))
     return ReferenceGraph(problem, factors, native_values(problem))
 
 
@@ -199,8 +199,8 @@ def baseline_of(source: ScaleSource, sigma_m: float, seed: int = 0) -> tuple[flo
     problem, true = measured(replace(source, sigma_m=sigma_m), seed=seed)
     if seed:  # the tape errs
         error = sigma_m * np.random.default_rng(seed).standard_normal()
-        assert problem.scale is not None
-        problem = replace(problem, scale=replace(problem.scale, length_m=LENGTH_M + error))
+        (tape,) = problem.scales
+        problem = replace(problem, scales=(replace(tape, length_m=LENGTH_M + error),))
     graph = build(problem, options_of())
     estimate, values, _ = solve(graph, relative_tolerance=1e-12)
     covariance = calibration_covariance(graph, estimate, values).model
@@ -242,7 +242,7 @@ def test_the_scales_sigma_is_the_tapes_and_the_clicks(click_sigma_px: float) -> 
     graph = build(problem, options_of())
     estimate, values, _ = solve(graph, relative_tolerance=1e-12)
     noise = root_information(problem, graph.options)
-    total = total_sigma_m(problem, noise, graph.layout.lens_of, "none", np.inf, values)
+    total = total_sigma_m(problem, source, noise, graph.layout.lens_of, "none", np.inf, values)
     a, b = estimate.points[list(source.points)]
     along = (b - a) / np.linalg.norm(b - a)
     variance = SIGMA_M**2
@@ -260,8 +260,9 @@ def test_the_scales_sigma_is_the_tapes_and_the_clicks(click_sigma_px: float) -> 
         variance += along @ np.linalg.inv(J.T @ J) @ along
     assert total == pytest.approx(variance**0.5, rel=1e-5)
     assert total > 1.05 * SIGMA_M
-    path = replace(problem, scale=SOURCES["path"])
-    assert total_sigma_m(path, noise, graph.layout.lens_of, "none", np.inf, values) == SIGMA_M
+    path = SOURCES["path"]
+    of_path = total_sigma_m(problem, path, noise, graph.layout.lens_of, "none", np.inf, values)
+    assert of_path == SIGMA_M
 
 
 # ---- ends that are lost, and renumbered -----------------------------------------------------
@@ -269,7 +270,7 @@ def test_the_scales_sigma_is_the_tapes_and_the_clicks(click_sigma_px: float) -> 
 
 def ends_of(problem: Problem) -> FloatArray:
     """Places (2, 3) of the measured distance's ends."""
-    scale, start = problem.scale, problem.initial
+    (scale,), start = problem.scales, problem.initial
     if isinstance(scale, KnownSpan):
         return start.points[list(scale.points)]
     assert isinstance(scale, KnownPath)
@@ -280,16 +281,18 @@ def test_ends_keep_their_place_when_others_go() -> None:
     problem, _ = measured(KnownPath((1, 3), LENGTH_M, SIGMA_M))
     first = problem.observations.frame == 0
     small = compact(problem, problem.observations.subset(~first))
-    assert isinstance(small.scale, KnownPath) and small.scale.frames == (0, 2)
+    (path,) = small.scales
+    assert isinstance(path, KnownPath) and path.frames == (0, 2)
     np.testing.assert_array_equal(ends_of(small), ends_of(problem))
     problem, _ = measured(KnownSpan((25, 7), LENGTH_M, SIGMA_M))
     others = np.isin(problem.observations.point, (0, 3, 11, 28))
     small = compact(problem, problem.observations.subset(~others))
-    assert isinstance(small.scale, KnownSpan) and small.scale.points == (22, 5)
+    (span,) = small.scales
+    assert isinstance(span, KnownSpan) and span.points == (22, 5)
     np.testing.assert_array_equal(ends_of(small), ends_of(problem))
     baseline, _ = measured(SOURCES["baseline"])
     first = baseline.observations.frame == 0
-    assert compact(baseline, baseline.observations.subset(~first)).scale == baseline.scale
+    assert compact(baseline, baseline.observations.subset(~first)).scales == baseline.scales
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,6 @@ def test_the_threshold_on_parallax_is_in_degrees() -> None:
 def test_compacting_with_everything_seen_changes_nothing() -> None:
     problem, _ = simulate_tracks(TrackOptions(frames=6, points=300), np.random.default_rng(0))
     again = compact(problem, problem.observations)
-    assert again.frame_names == problem.frame_names and again.scale == problem.scale
+    assert again.frame_names == problem.frame_names and again.scales == problem.scales
     np.testing.assert_array_equal(again.initial.points, problem.initial.points)
     np.testing.assert_array_equal(again.observations.frame, problem.observations.frame)

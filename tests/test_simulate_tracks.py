@@ -62,9 +62,9 @@ def test_the_initial_estimate_is_off_as_stated() -> None:
     first = problem.initial.cam_from_rig[0]
     np.testing.assert_array_equal(first.rotation, np.eye(3))
     np.testing.assert_array_equal(first.translation, np.zeros(3))
-    assert problem.scale
+    (scale,) = problem.scales
     true_m = np.linalg.norm(true.cam_from_rig[1].inverse.translation)
-    assert 0 < abs(problem.scale.length_m - true_m) < 5 * problem.scale.sigma_m
+    assert 0 < abs(scale.length_m - true_m) < 5 * scale.sigma_m
 
 
 def test_tracks_keep_their_limits() -> None:
@@ -111,7 +111,7 @@ def test_tracks_survive_the_file(rig: str, tmp_path: Path) -> None:
         residuals_px(again.initial, again.observations),
         residuals_px(problem.initial, problem.observations),
     )
-    assert again.scale == problem.scale
+    assert again.scales == problem.scales
     assert again.frame_names == problem.frame_names
     calibration = load_calibration(tmp_path / "truth.json")
     np.testing.assert_array_equal(calibration.camera("cam0").params, true.cameras[0].params)

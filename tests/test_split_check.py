@@ -97,7 +97,7 @@ def test_what_both_halves_believe_moves_them_together() -> None:
     expected = []
     for sigma_m in (0.0005, 0.05):
         start = problem_of(baseline_sigma_m=0.0)
-        check = checked(replace(start, scale=KnownBaseline((0, 1), 0.2, sigma_m)))
+        check = checked(replace(start, scales=(KnownBaseline((0, 1), 0.2, sigma_m),)))
         assert check is not None
         expected.append(check.expected_px)
     assert expected[1] == pytest.approx(expected[0], rel=0.1)

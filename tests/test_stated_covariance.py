@@ -163,7 +163,7 @@ def with_span(problem: Problem) -> Problem:
     ends = np.flatnonzero(length == 3)[:2].tolist()
     places = problem.initial.points[ends]
     scale = KnownSpan((ends[0], ends[1]), float(np.linalg.norm(places[1] - places[0])), 0.001, 1.0)
-    return replace(problem, scale=scale)
+    return replace(problem, scales=(scale,))
 
 
 def test_clicks_stay_when_their_frames_are_left_out() -> None:

@@ -60,7 +60,7 @@ def test_noise_is_scaled_by_the_sigma_of_each_observation(refinement: Refinement
 
 def test_a_measured_distance_errs_anew(refinement: Refinement) -> None:
     rng = np.random.default_rng(2)
-    scales = [twin_problem(refinement, rng).scale for _ in range(40)]
+    scales = [twin_problem(refinement, rng).scales[0] for _ in range(40)]
     lengths = [scale.length_m for scale in scales if isinstance(scale, KnownBaseline)]
     true = np.linalg.norm(refinement.estimate.cam_from_rig[1].translation)
     assert np.std(lengths) == pytest.approx(TRACKS.baseline_sigma_m, rel=0.4)

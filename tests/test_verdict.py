@@ -55,11 +55,11 @@ def jackknife(*failed: tuple[str, str]) -> Jackknife:
     return Jackknife(NAMES, np.zeros((len(kept), 2)), np.eye(2), kept, failed)
 
 
-def problem_of(frames: int, kept: int, scale: KnownBaseline | None = None) -> Problem:
+def problem_of(frames: int, kept: int, *scales: KnownBaseline) -> Problem:
     """One camera that observes points in one frame after the other, some of them in the last."""
     frame = np.arange(kept) % frames
     seen = Observations(np.zeros((kept, 2)), frame, np.zeros_like(frame), np.zeros_like(frame))
-    return Problem(rig(1), seen, tuple(f"{i:06d}" for i in range(frames)), 0, scale)
+    return Problem(rig(1), seen, tuple(f"{i:06d}" for i in range(frames)), 0, scales)
 
 
 def run(
@@ -74,7 +74,7 @@ def run(
     **own: object,
 ) -> Run:
     """A run without anything to say of it; off: prior sigmas by which parameters come out off."""
-    problem = problem_of(frames, kept, scale)
+    problem = problem_of(frames, kept, *([scale] if scale else []))
     (camera,) = problem.initial.cameras
     prior = stated_lens_prior(camera, weak_lens_prior(camera), camera.named(), stated, ("cy",))
     moves = np.array([(off or {}).get(name, 0.0) for name in camera.names]) * prior.sigma

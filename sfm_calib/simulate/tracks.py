@@ -119,8 +119,8 @@ def simulate_tracks(options: TrackOptions, rng: np.random.Generator) -> tuple[Pr
     )
     observations = _with_errors(numbered, true, options, rng)
     names = tuple(f"{f:06d}" for f in frames)
-    scale = _measured_baseline(rig, options, rng)
-    return Problem(_perturbed(true, options, rng), observations, names, 0, scale), true
+    scales = _measured_baseline(rig, options, rng)
+    return Problem(_perturbed(true, options, rng), observations, names, 0, scales), true
 
 
 def check_options(options: TrackOptions) -> None:
@@ -233,13 +233,13 @@ def _perturbed(true: Estimate, options: TrackOptions, rng: np.random.Generator) 
 
 def _measured_baseline(
     rig: SimulatedRig, options: TrackOptions, rng: np.random.Generator
-) -> KnownBaseline | None:
-    """The first baseline as a tape would have it: its error follows the sigma stated."""
+) -> tuple[KnownBaseline, ...]:
+    """The first baseline as a tape would have it, if any: its error follows the sigma stated."""
     if len(rig.cameras) < 2 or options.baseline_sigma_m == 0:
-        return None
+        return ()
     first, second = (t.inverse.translation for t in rig.cam_from_rig[:2])
     length_m = float(np.linalg.norm(second - first)) + options.baseline_sigma_m * rng.normal()
-    return KnownBaseline((0, 1), length_m, options.baseline_sigma_m)
+    return (KnownBaseline((0, 1), length_m, options.baseline_sigma_m),)
 
 
 # ---- storage -------------------------------------------------------------------------------
@@ -267,9 +267,10 @@ def write_tracks(problem: Problem, true: Estimate, folder: Path) -> None:
     }
     if problem.observations.feature_scale is not None:
         arrays["feature_scale"] = problem.observations.feature_scale
-    if isinstance(problem.scale, KnownBaseline):
-        arrays["scale_cameras"] = np.array(problem.scale.cameras)
-        arrays["scale"] = np.array([problem.scale.length_m, problem.scale.sigma_m])
+    baselines = [one for one in problem.scales if isinstance(one, KnownBaseline)]
+    if baselines:
+        arrays["scale_cameras"] = np.array([one.cameras for one in baselines])
+        arrays["scale"] = np.array([(one.length_m, one.sigma_m) for one in baselines])
     arrays |= _estimate_arrays("initial", problem.initial) | _estimate_arrays("truth", true)
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
@@ -315,10 +316,13 @@ def _stacked(transforms: tuple[Transform, ...]) -> FloatArray:
 
 
 def _problem_from(arrays: Arrays) -> Problem:
-    scale = None
-    if "scale" in arrays:
-        first, second = arrays["scale_cameras"].tolist()
-        scale = KnownBaseline((first, second), *arrays["scale"].tolist())
+    scales: tuple[KnownBaseline, ...] = ()
+    if "scale" in arrays:  # files of old hold one, flat
+        cameras = arrays["scale_cameras"].reshape(-1, 2).tolist()
+        lengths = arrays["scale"].reshape(-1, 2).tolist()
+        scales = tuple(
+            KnownBaseline((a, b), *length) for (a, b), length in zip(cameras, lengths, strict=True)
+        )
     return Problem(
         _estimate_from("initial", arrays),
         replace(
@@ -327,7 +331,7 @@ def _problem_from(arrays: Arrays) -> Problem:
         ),
         tuple(arrays["frame_names"].tolist()),
         int(arrays["reference"]),
-        scale,
+        scales,
     )
 
 

@@ -48,9 +48,9 @@ def small_problem(
     seen = replace(blank, pixels=pixels + sigma_px * rng.standard_normal(pixels.shape))
     assert np.isfinite(pixels).all()
     names = tuple(f"{frame:06d}" for frame in range(frames))
-    scale = _measured(true) if baseline else None
+    scales = (_measured(true),) if baseline else ()
     return Problem(
-        perturbed(true, reference, start_error, rng), seen, names, reference, scale
+        perturbed(true, reference, start_error, rng), seen, names, reference, scales
     ), true
 
 
