@@ -57,12 +57,19 @@ def redundancy(problem: Problem, options: GraphOptions | None = None) -> float:
 def redundancies(problem: Problem, options: GraphOptions | None = None) -> FloatArray:
     """The same of each observation (n_obs,): a point takes three numbers of its track.
 
-    It takes them by weight; frames, lenses and rig take theirs from all alike.
+    It takes them by weight; frames, lenses and rig take theirs from all alike, but for frames that
+    see a board.
     """
     seen = problem.observations
     weight = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma**-2.0
     of_track: FloatArray = np.bincount(seen.point, weight).astype(np.float64)[seen.point]
-    left = np.where(problem.known[seen.point], 1.0, left_by_point(weight, of_track))
+    # A corner's place is given; its frame has few others to take its own place from.
+    in_frame = np.bincount(seen.frame)[seen.frame]
+    left = np.where(
+        problem.known[seen.point],
+        np.maximum(1 - 3 / in_frame, LEAST_REDUNDANCY),
+        left_by_point(weight, of_track),
+    )
     result: FloatArray = left * redundancy(problem, options) / float(left.mean())
     return result
 
@@ -104,6 +111,7 @@ class NoiseClass:
     largest_px: float  # to
     count: int
     sigma_px: float  # robust, of one coordinate
+    of_board: bool = False
 
 
 def noise_classes(
@@ -112,10 +120,12 @@ def noise_classes(
     """The noise of each camera by the size of its keypoints, from residuals (n_obs, 2) in px."""
     lengths = np.linalg.norm(residuals, axis=1) / np.sqrt(redundancies(problem, options))
     size, found = problem.observations.feature_scale, []
-    for camera, rows in _classes(problem, np.isfinite(lengths)):
+    for camera, rows, of_board in _classes(problem, np.isfinite(lengths)):
         sigma_px = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN
-        ends = (0.0, np.inf) if size is None else (size[rows].min(), size[rows].max())
-        found.append(NoiseClass(camera, float(ends[0]), float(ends[1]), len(rows), sigma_px))
+        ends = (0.0, np.inf)
+        if size is not None and not of_board:
+            ends = (float(size[rows].min()), float(size[rows].max()))
+        found.append(NoiseClass(camera, *ends, len(rows), sigma_px, of_board))
     return tuple(found)
 
 
@@ -135,21 +145,28 @@ def with_class_sigmas(
     if not of_all > SMALLEST_SIGMA_PX:
         return problem
     relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma.copy()
-    for _, rows in _classes(problem, finite):
+    for _, rows, _ in _classes(problem, finite):
         factor = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN / of_all
         relative[rows] *= np.clip(factor, 1 / WIDEST_FACTOR, WIDEST_FACTOR)
     return replace(problem, observations=replace(seen, relative_sigma=relative))
 
 
-def _classes(problem: Problem, projected: NDArray[np.bool_]) -> Iterator[tuple[int, IntArray]]:
-    """Camera and rows of each class: half octaves of keypoint size, joined until large enough.
+def _classes(
+    problem: Problem, projected: NDArray[np.bool_]
+) -> Iterator[tuple[int, IntArray, bool]]:
+    """Camera and rows of each class, and whether it is of a board: half octaves of keypoint size,
+    joined until large enough, and the corners of the board.
 
     Observations that are not `projected` (n_obs,), and where some sizes are known those whose size
     is not, as those of clicked marks, are in none.
     """
     seen = problem.observations
+    of_board = problem.known[seen.point]
     for camera in range(len(problem.initial.cameras)):
-        rows = np.flatnonzero((seen.camera == camera) & projected)
+        own = (seen.camera == camera) & projected
+        if (own & of_board).any():
+            yield camera, np.flatnonzero(own & of_board), True
+        rows = np.flatnonzero(own & ~of_board)
         if seen.feature_scale is not None and np.isfinite(seen.feature_scale).any():
             rows = rows[seen.feature_scale[rows] > 0]
             half_octave = np.floor(2 * np.log2(seen.feature_scale[rows]))
@@ -161,7 +178,7 @@ def _classes(problem: Problem, projected: NDArray[np.bool_]) -> Iterator[tuple[i
         for end in [*edges.tolist(), len(rows)]:
             left = len(rows) - end
             if (end - begin >= CLASS_SIZE and left >= CLASS_SIZE) or (left == 0 and end > begin):
-                yield camera, rows[begin:end]
+                yield camera, rows[begin:end], False
                 begin = end
 
 

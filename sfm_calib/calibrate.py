@@ -34,7 +34,7 @@ from sfm_calib.nominal import (
     start_from_config,
 )
 from sfm_calib.result import Calibration
-from sfm_calib.run import Run
+from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
 
 FEW_PLACED = 0.5  # of the images: of scans that went well, nine in ten and more are
@@ -81,16 +81,25 @@ def calibrate(
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
     problem = start_from_config(mapped.problem, config)
     with enough_placed(problem, len(scan.images)):
-        with watch.stage("choosing the lens"):
-            ladder = choose_lens(problem, config, progress)
-        with watch.stage("solving"):
-            refinement = solve_problem(problem, config, progress, ladder)
-        with watch.stage("covariance"):
-            covariance, split = covariance_of(refinement, config, progress)
+        return determine(Given(scan, config, mapped, command), problem, watch, progress)
+
+
+def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progress) -> Outcome:
+    """From a problem to its result: the lens, the optimum, how sure it is, and what to say of it.
+
+    Raises CalibrationError where the problem determines too little.
+    """
+    config = given.config
+    with watch.stage("choosing the lens"):
+        ladder = choose_lens(problem, config, progress)
+    with watch.stage("solving"):
+        refinement = solve_problem(problem, config, progress, ladder)
+    with watch.stage("covariance"):
+        covariance, split = covariance_of(refinement, config, progress)
     with watch.stage("certificate"):
         certificate = certificate_of(refinement, config, progress)
     run = Run(
-        scan, config, mapped, refinement, covariance, watch.seconds, command,
+        given.scan, config, given.mapped, refinement, covariance, watch.seconds, given.command,
         ladder, split, certificate,
     )  # fmt: skip
     calibration, unit = summarise(run)

@@ -15,6 +15,16 @@ from sfm_calib.mapping import Mapped
 
 
 @dataclass(frozen=True)
+class Given:
+    """What a calibration starts from, for what is said of it."""
+
+    scan: Scan
+    config: RigConfig
+    mapped: Mapped
+    command: str
+
+
+@dataclass(frozen=True)
 class Run:
     """Everything a finished calibration knows of itself."""
 
