@@ -212,6 +212,7 @@ def thinned(problem: Problem, max_observations: int) -> Problem:
     kept[lot[np.cumsum(length[lot]) <= max_observations]] = True
     in_frame = np.bincount(seen.frame[kept[seen.point]], minlength=len(problem.frame_names))
     kept[seen.point[(in_frame < LEAST_IN_FRAME)[seen.frame]]] = True
+    kept |= problem.known  # what says most of a lens
     return compact(problem, seen.subset(kept[seen.point]))
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from graphs.boards import corners_of, shape_of
 from graphs.frames import FloatArray
 from graphs.problem import Problem, points_in_cameras
 from graphs.selection import parallax_deg
@@ -85,8 +86,10 @@ class Views:
 def views_of(problem: Problem) -> tuple[Views, ...]:
     """What each camera's views are like, at the problem's start: best once it is solved.
 
-    A camera that sees nothing is left out.
+    A camera that sees nothing is left out. Where all frames see a board, it is the scene; else its
+    corners do not count.
     """
+    problem = _of_scene(problem)
     start, seen = problem.initial, problem.observations
     n = len(start.cameras)
     # A track of each camera by itself: what moves between frames, not between cameras.
@@ -114,11 +117,44 @@ def views_of(problem: Problem) -> tuple[Views, ...]:
     return tuple(views)
 
 
+def _of_scene(problem: Problem) -> Problem:
+    """The problem whose points are the scene's, or those of the board that all frames see."""
+    if problem.board is None:
+        return problem
+    seen, start = problem.observations, problem.initial
+    if not problem.board_frames.all():
+        return replace(problem, observations=seen.subset(~problem.known[seen.point]), board=None)
+    corners = corners_of(problem.board.board, shape_of(start, problem.board.board))[0]
+    return replace(
+        problem,
+        initial=replace(start, points=corners),
+        observations=replace(seen, point=problem.board.corner[seen.point]),
+        board=None,
+    )
+
+
 def shared_lacks(views: Sequence[Views]) -> tuple[Lack, ...]:
     """What is degenerate about the views of every camera."""
     if not views:
         return ()
     return tuple(lack for lack in views[0].lacks if all(lack in one.lacks for one in views))
+
+
+def of_board_in_words(lack: Lack, views: Sequence[Views]) -> str:
+    """As `in_words`, where the scene is a board that is shown to the cameras."""
+    if lack in ("static rig", "pure rotation"):
+        return (
+            "the board hardly moved: its views differ by "
+            f"{max(v.turn_deg for v in views):.1f} deg at most; show it in other places, tilted to "
+            "all sides"
+        )
+    if lack == "pure forward motion":
+        return "the board only came nearer and went away: tilt it to all sides"
+    return (
+        "near-frontal views: the board faces the cameras within "
+        f"{max(v.tilt_deg for v in views):.0f} deg in nine of ten views, which leaves the focal "
+        "length open: tilt it by 30 to 45 deg, to all sides"
+    )
 
 
 def in_words(lack: Lack, views: Sequence[Views]) -> str:

@@ -19,11 +19,11 @@ from graphs.camera import focal_on_axis
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, reported_from_tangent
 from graphs.image_grid import ImageGrid, centre, corners, image_grid, typical_distances
-from graphs.motion import Views, shared_lacks, views_of
+from graphs.motion import Views, of_board_in_words, shared_lacks, views_of
 from graphs.motion import in_words as motion_in_words
 from graphs.problem import Estimate, IntArray
 from graphs.propagation import lens_names, pose_names
-from graphs.remedies import NO_MOTION, Kind, Move, classify, in_words, remedy
+from graphs.remedies import NO_MOTION, Kind, Move, board_remedy, classify, in_words, remedy
 
 # One stated sigma along a weak direction: about what a single feature is uncertain by. Simulated
 # rigs in hand stay at 0.2 px (three cameras, 40 frames) to 0.49 px (one camera); real scans from
@@ -78,16 +78,18 @@ def observe(
 ) -> Observability:
     """All there is to say of an optimum; unit: of the covariances' lengths, in the estimate's."""
     views = views_of(replace(graph.problem, initial=estimate))
+    by_board = bool(graph.problem.board_frames.all())
     reported = estimate.scaled(1 / unit)
     distances = typical_distances(reported, graph.problem.observations).tolist()
     priors = prior_information(graph, estimate, stated.names, unit)
-    weak = weak_directions(reported, stated, model, priors, distances, views)
+    weak = weak_directions(reported, stated, model, priors, distances, views, by_board)
     # A rig that only drives straight may have learned all there is; one that stands still has not.
     lacks = [lack for lack in shared_lacks(views) if weak or lack in NO_MOTION]
+    told = of_board_in_words if by_board else motion_in_words
     return Observability(
         weak=weak,
         unusable=unusable(reported, stated, distances),
-        lacks=tuple(motion_in_words(lack, views) for lack in lacks),
+        lacks=tuple(dict.fromkeys(told(lack, views) for lack in lacks)),
         prior_shares=prior_shares(model, priors),
     )
 
@@ -99,13 +101,14 @@ def weak_directions(
     prior_information: FloatArray,
     distances: Sequence[float],
     views: Sequence[Views] = (),
+    by_board: bool = False,
 ) -> tuple[WeakDirection, ...]:
     """What the scan leaves open by more than WEAK_PX, the most open first; empty for a good scan.
 
     stated, model: covariances of the same parameters in the estimate's unit, singular where
     cameras share a lens or a length is held. prior_information (n, n): what priors add on these
     very parameters, as `prior_information` has it. distances (n_cameras,): of what each camera
-    sees. views: for remedies that fit the scan.
+    sees. views: for remedies that fit the scan; by_board: it is one of a board alone.
     Every parameter whose own sigma moves the picture by WEAK_PX is named in one of them.
     """
     if not stated.names:
@@ -129,7 +132,7 @@ def weak_directions(
         move = Move(names, column, step[first], *_ends(estimate, grid, effect))
         found.append(_direction(move, classify(estimate, move, views), involved, float(share)))
     every = (_with_twins(one, stated.names, twins) for one in _merged(found))
-    return tuple(_told(one, estimate, views) for one in every)
+    return tuple(_told(one, estimate, views, by_board) for one in every)
 
 
 def prior_information(
@@ -320,14 +323,18 @@ def _direction(move: Move, kind: Kind, involved: NDArray[np.bool_], share: float
     )
 
 
-def _told(one: WeakDirection, estimate: Estimate, views: Sequence[Views]) -> WeakDirection:
+def _told(
+    one: WeakDirection, estimate: Estimate, views: Sequence[Views], by_board: bool
+) -> WeakDirection:
     """With what it is and its remedy in words."""
     px, own = np.array(one.moves_px), np.array(one.moves)
     move = Move(one.parameters, px, own, one.effect_centre_px, one.effect_corner_px)
     return replace(
         one,
         what=in_words(one.kind, move, estimate, views),
-        remedy=remedy(one.kind, move, estimate, views),
+        remedy=board_remedy(one.kind, move)
+        if by_board
+        else remedy(one.kind, move, estimate, views),
     )
 
 

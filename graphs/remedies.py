@@ -177,6 +177,8 @@ NO_MOTION = {
     "static rig": "move the rig between frames, sideways, and turn it",
     "pure rotation": "step sideways between frames",
 }
+OR_A_BOARD = "or show it a board a few times (--board)"
+NONE_NEEDED = "none is needed: together they are known; a lens with fewer of them might do"
 ON_ITS_SIDE = "with the camera turned by 90 degrees about its optical axis"
 
 
@@ -184,7 +186,7 @@ def remedy(kind: Kind, move: Move, estimate: Estimate, views: Sequence[Views]) -
     """What to do for the direction to become strong, in view of what the scan's views lack."""
     own = views[_leading_camera(estimate, move, GROUP[kind])] if views else None
     if kind == "distortion" and move.corner_px < CANCELLED * float(np.linalg.norm(move.px)):
-        return "none is needed: together they are known; a lens with fewer of them might do"
+        return NONE_NEEDED
     for lack, what in NO_MOTION.items():
         if own is not None and lack in own.lacks:
             return what
@@ -205,6 +207,21 @@ def remedy(kind: Kind, move: Move, estimate: Estimate, views: Sequence[Views]) -
         "scale": "measure a longer distance, or measure it more exactly",
         "doming": f"take oblique views too, some of them {ON_ITS_SIDE}, or from other distances",
     }.get(kind, "let things of the scene pass through the corners of the image")
+
+
+def board_remedy(kind: Kind, move: Move) -> str:
+    """As `remedy`, where a board is all that was seen."""
+    if kind == "distortion" and move.corner_px < CANCELLED * float(np.linalg.norm(move.px)):
+        return NONE_NEEDED
+    if kind.startswith("focal"):
+        return "tilt the board by 30 to 45 deg, to all sides, near and far"
+    if kind == "principal point":
+        return "show the board tilted in every corner of the image, and turned by 90 deg in it"
+    return {
+        "rotation in the rig": "show the board to the cameras at once, tilted, near and far",
+        "translation in the rig": "show the board to the cameras at once, near them",
+        "scale": "measure the squares over the whole board, and say how well (square_sigma_m)",
+    }.get(kind, "bring the board to the edges and into the corners of the image")
 
 
 def _for_focal(kind: Kind, own: Views | None) -> str:
@@ -230,8 +247,11 @@ def _for_focal(kind: Kind, own: Views | None) -> str:
 
 def _for_centre(own: Views | None) -> str:
     if own is None or own.roll_deg > LEVEL_DEG:
-        return "take more views, turned differently about the optical axis"
-    return "turn the rig about its optical axis: take some views with the camera on its side"
+        return f"take more views, turned differently about the optical axis, {OR_A_BOARD}"
+    return (
+        "turn the rig about its optical axis: take some views with the camera on its side, "
+        f"{OR_A_BOARD}"
+    )
 
 
 # ---- what leads ----------------------------------------------------------------------------
