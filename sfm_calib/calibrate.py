@@ -100,7 +100,7 @@ def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progre
         certificate = certificate_of(refinement, config, progress)
     run = Run(
         given.scan, config, given.mapped, refinement, covariance, watch.seconds, given.command,
-        ladder, split, certificate,
+        ladder, split, certificate, given.board,
     )  # fmt: skip
     calibration, unit = summarise(run)
     return Outcome(calibration, refinement, unit)
@@ -123,7 +123,7 @@ def choose_lens(problem: Problem, config: RigConfig, progress: Progress) -> Ladd
     autos = on_ladder(config, [camera.name for camera in problem.initial.cameras])
     if not autos:
         return None
-    with _refusals(problem):
+    with refusals(problem):
         return climb(
             problem,
             lambda changed: options_of(changed, config),
@@ -146,7 +146,7 @@ def solve_problem(
             lambda changed: options_of(changed, config),
             on_ladder(config, [camera.name for camera in problem.initial.cameras]),
         )
-    with _refusals(problem):
+    with refusals(problem):
         return refine(
             problem,
             options,
@@ -173,7 +173,7 @@ def enough_placed(problem: Problem, n_images: int) -> Iterator[None]:
 
 
 @contextmanager
-def _refusals(problem: Problem | None = None) -> Iterator[None]:
+def refusals(problem: Problem | None = None) -> Iterator[None]:
     """What the maths refuses, in one line; of a `problem` without motion, by its name."""
     try:
         yield
@@ -192,7 +192,7 @@ def covariance_of(
     graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
     parallax = config.min_parallax_deg
     progress("covariance", 0, 0)
-    with _refusals():
+    with refusals():
         covariance = calibration_covariance(
             graph, estimate, values, parallax,
             on_block=lambda done, total: progress("leaving out frames", done, total),
@@ -206,7 +206,7 @@ def certificate_of(
     """How the stated sigmas do on simulated twins of the scan, where that is asked for."""
     if config.certify == 0:
         return None
-    with _refusals():
+    with refusals():
         return certify(
             refinement, config.certify, config.seed, config.min_parallax_deg,
             adaptive=config.loss == "adaptive",

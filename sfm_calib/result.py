@@ -107,6 +107,7 @@ class NoiseBySize(Record):
     largest_px: float | None  # to
     n_observations: int
     sigma_px: float  # robust, of one pixel coordinate
+    of_board: bool = False  # corners of the board
 
 
 class Noise(Record):
@@ -282,6 +283,30 @@ class Solve(Record):
     seconds: dict[str, float] = {}
 
 
+class Without(Record):
+    """A parameter as the scan alone has it, without the board."""
+
+    sigma: float | None  # stated, in the covariance's unit; None: without a metre, no length is
+    moved: float | None  # by the board, in that unit
+
+
+class BoardResult(Record):
+    """The calibration board that took part, and what became of it."""
+
+    description: str
+    n_images: dict[str, int]  # of each camera, in which it was seen and used
+    n_corners: dict[str, int]
+    sigma_px: dict[str, float]  # robust, of one coordinate of its corners
+    in_scan: Literal["", "still", "waved"] = ""  # where it was seen in the scan itself
+    size: float = 1.0  # estimated over stated lengths
+    sigma_size: float = 0.0
+    bend_mm: tuple[float, float] = (0.0, 0.0)  # of its middle, against left and right, top and foot
+    sigma_bend_mm: tuple[float, float] = (0.0, 0.0)  # 0: held flat
+    left_out: tuple[str, ...] = ()  # `camera/frame: reason`
+    repeated: tuple[str, ...] = ()  # groups of frames that show it in one place
+    without: dict[str, Without] = {}  # of each parameter: what the scan alone says of it
+
+
 class Provenance(Record):
     """What made the result: enough to make it again."""
 
@@ -305,6 +330,7 @@ class Calibration(Record):
     covariance: Covariance = Covariance()
     noise: Noise | None = None
     uncertainty: Uncertainty | None = None
+    board: BoardResult | None = None  # None: none was used
     lens_choice: LensChoice | None = None  # None: every camera's lens was given
     verdict: Verdict | None = None
     solve: Solve | None = None

@@ -9,6 +9,7 @@ from graphs.refine import Refinement
 from graphs.split_check import SplitCheck
 from graphs.stated_covariance import CalibrationCovariance
 from graphs.twin import Certificate
+from sfm_calib.board_use import BoardUse
 from sfm_calib.config import RigConfig
 from sfm_calib.images import Scan
 from sfm_calib.mapping import Mapped
@@ -22,6 +23,7 @@ class Given:
     config: RigConfig
     mapped: Mapped
     command: str
+    board: BoardUse | None = None
 
 
 @dataclass(frozen=True)
@@ -38,3 +40,4 @@ class Run:
     ladder: Ladder | None = None
     split: SplitCheck | None = None
     certificate: Certificate | None = None
+    board: BoardUse | None = None

@@ -20,6 +20,7 @@ from graphs.problem import images_seen, residuals_px
 from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
+from sfm_calib.board_summary import board_result
 from sfm_calib.run import Run
 from sfm_calib.scale import in_words
 from sfm_calib.uncertainty import uncertainty_of
@@ -46,6 +47,7 @@ def summarise(run: Run) -> tuple[result.Calibration, float]:
         uncertainty=uncertainty_of(
             in_unit, covariance, _typical_sigma_px(run.refinement), _unit_name(run)
         ),
+        board=board_result(run),
         lens_choice=None if run.ladder is None else _lens_choice(run.ladder),
         verdict=verdict_of(run),
         solve=_solve(run),
@@ -59,13 +61,14 @@ def _noise(run: Run) -> result.Noise:
     by_size: dict[str, list[result.NoiseBySize]] = {name: [] for name in names}
     for one in run.refinement.noise:
         ends = one.smallest_px, one.largest_px
-        known = np.isfinite(ends).all()
+        known = bool(np.isfinite(ends).all())
         by_size[names[one.camera]].append(
             result.NoiseBySize(
                 smallest_px=ends[0] if known else None,
                 largest_px=ends[1] if known else None,
                 n_observations=one.count,
                 sigma_px=one.sigma_px,
+                of_board=one.of_board,
             )
         )
     jackknife = covariance.jackknife

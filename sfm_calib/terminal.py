@@ -22,6 +22,7 @@ from rich.table import Table
 
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
+from sfm_calib.board_terminal import board_lines, with_and_without
 from sfm_calib.images import Progress as Report
 from sfm_calib.report import TruthRow
 from sfm_calib.report.checks import checks_of
@@ -117,6 +118,7 @@ def print_result(calibration: Calibration, console: Console) -> None:
     if len(calibration.cameras) > 1:
         _print_rig(calibration, console)
     _print_lens_choice(calibration, console)
+    _print_board(calibration, console)
     _print_basis(calibration, console)
     _print_verdict(calibration, console)
 
@@ -137,6 +139,15 @@ def _print_lens_choice(calibration: Calibration, console: Console) -> None:
             str(len(rung.weak)),
         )
     console.print(table)
+
+
+def _print_board(calibration: Calibration, console: Console) -> None:
+    if calibration.board is None:
+        return
+    for line in board_lines(calibration.board):
+        _print_line(console, line)
+    if (table := with_and_without(calibration)) is not None:
+        console.print(table)
 
 
 def _word(marks: Sequence[Mark]) -> str:

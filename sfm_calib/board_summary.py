@@ -1,0 +1,65 @@
+"""What is said of the board that took part in a calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from graphs.board_shape import shape_sigmas
+from graphs.boards import shape_of
+from graphs.jackknife import change
+from graphs.problem import images_seen
+from sfm_calib import result
+from sfm_calib.run import Run
+
+
+def board_result(run: Run) -> result.BoardResult | None:
+    """The record; None where no board was used."""
+    use, problem, estimate = run.board, run.refinement.problem, run.refinement.estimate
+    if use is None or problem.board is None:
+        return None
+    names = [camera.name for camera in estimate.cameras]
+    corners = problem.observations.subset(problem.known[problem.observations.point])
+    images = Counter(images_seen(corners)[:, 0].tolist())
+    shape = shape_of(estimate, problem.board.board)
+    sigma = shape_sigmas(
+        run.refinement.graph, estimate, run.refinement.values, run.covariance.inflation
+    )
+    bends, of_bends = 1e3 * np.exp(shape[0]) * shape[1:], 1e3 * sigma[1:]
+    held = problem.board.board.shape_sigma[1:] == 0
+    return result.BoardResult(
+        description=use.board.described,
+        n_images={name: images[index] for index, name in enumerate(names)},
+        n_corners={name: int((corners.camera == index).sum()) for index, name in enumerate(names)},
+        sigma_px={names[one.camera]: one.sigma_px for one in run.refinement.noise if one.of_board},
+        in_scan=use.in_scan,
+        size=float(np.exp(shape[0])),
+        sigma_size=float(sigma[0] * np.exp(shape[0])),
+        bend_mm=(float(bends[0]), float(bends[1])),
+        sigma_bend_mm=(
+            0.0 if held[0] else float(of_bends[0]),
+            0.0 if held[1] else float(of_bends[1]),
+        ),
+        left_out=use.left_out,
+        repeated=use.repeated,
+        without=_without(run),
+    )
+
+
+def _without(run: Run) -> dict[str, result.Without]:
+    """What the scan alone says of each parameter, beside what the board moved."""
+    alone = None if run.board is None else run.board.without
+    if alone is None:
+        return {}
+    names, metric = alone.covariance.stated.names, alone.covariance.basis.unit_camera is None
+    before = alone.estimate
+    after = run.refinement.estimate
+    moved = dict(zip(names, change(before, after, names).tolist(), strict=True))
+    found = {}
+    for name, sigma in alone.covariance.stated.sigma.items():
+        comparable = metric or ".translation_" not in name
+        found[name] = result.Without(
+            sigma=sigma if comparable else None, moved=moved[name] if comparable else None
+        )
+    return found

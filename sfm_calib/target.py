@@ -1,0 +1,173 @@
+"""The story of a target-based calibration: images of a board in, a Calibration out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from graphs.board_start import BoardScene, BoardStart, start_from_board
+from graphs.board_thin import redundant, thin
+
+from graphs.board_problem import SeenCorners, board_problem
+from graphs.camera import fit_lens
+from graphs.problem import Board, IntArray, Problem
+from sfm_calib.board_use import BoardUse
+from sfm_calib.boards import spec
+from sfm_calib.boards.find import find_board
+from sfm_calib.boards.views import BoardView, BoardViews
+from sfm_calib.cache import Cache
+from sfm_calib.calibrate import Given, Outcome, Stopwatch, determine, refusals
+from sfm_calib.config import RigConfig
+from sfm_calib.errors import CalibrationError
+from sfm_calib.files import sha256
+from sfm_calib.images import Progress, Scan
+from sfm_calib.mapping import Mapped, reference_of, some
+from sfm_calib.nominal import check_config, known_cameras, lens_of, on_ladder, start_from_config
+from sfm_calib.target_images import read_target
+
+# Of the board's longer side, how far its middle may stand out: paper on cardboard bows by a few
+# thousandths, mrcal's boards of a metre by one or two mm.
+BEND_SIGMA = 0.005
+MIN_VIEWS = 3  # of a camera: each gives two numbers on its lens beyond the board's place
+
+Matching = Literal["stem", "order", "time"]
+
+
+def calibrate_target(
+    images: Path,
+    board: spec.Board,
+    matching: Matching,
+    config: RigConfig,
+    cache: Cache,
+    progress: Progress,
+    command: str = "",
+) -> Outcome:
+    """Calibrate cameras, and the rig they sit on, from images of a board.
+
+    `progress(stage, done, total)` is called throughout; a total of 0 means unknown.
+    Raises CalibrationError with cause, number and remedy when the images do not allow it.
+    """
+    watch = Stopwatch()
+    with watch.stage("reading images"):
+        scan = read_target(images, cache, matching, config.video_frames, None, progress)
+        check_config(config, scan)
+    with watch.stage("finding the board"):
+        found = find_board(scan, board, progress)
+    with watch.stage("starting values"):
+        views = diverse(found.views, board, config.video_frames)
+        started = start(views, board, config, scan)
+        problem = with_lenses(problem_of(started, views, board, reference_of(scan, config)), config)
+    use = BoardUse(board, left_out(started, views), repeated(started, views, board))
+    messages = (*found.messages, *started.notes, *use.messages)
+    hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
+    mapped = Mapped(problem, messages, hashes)
+    given = Given(scan, config, mapped, command, use)
+    return determine(given, start_from_config(problem, config), watch, progress)
+
+
+def graph_board(board: spec.Board) -> Board:
+    """The board as the graph takes it: its corners, and what is known of its size and flatness."""
+    corners = board.corners_m
+    length = float(np.ptp(corners[:, :2], axis=0).max())
+    bend = BEND_SIGMA * length if board.warp else 0.0
+    return Board(corners, np.zeros(3), np.array([board.relative_sigma, bend, bend]))
+
+
+def diverse(views: BoardViews, board: spec.Board, most: int) -> BoardViews:
+    """Of more frames than `most`, those that differ most in how the board lies in them."""
+    if len({view.frame for view in views.views}) <= most:
+        return views
+    kept = tuple(views.views[i] for i in thin(views.views, most, board.corners_m, views.sizes))
+    return replace(views, views=kept)
+
+
+def start(views: BoardViews, board: spec.Board, config: RigConfig, scan: Scan) -> BoardStart:
+    """Lenses, rig and the board's places to start from, of all cameras.
+
+    Raises CalibrationError for cameras that saw too little of the board, or cannot be linked.
+    """
+    counts = Counter(view.camera for view in views.views)
+    for index, name in enumerate(views.cameras):
+        if counts[index] < MIN_VIEWS and not _is_known(config, name):
+            images = sum(image.camera == index for image in scan.images)
+            raise CalibrationError(
+                f"{name} shows {board.described} in {counts[index]} of {images} images (needs "
+                f"{MIN_VIEWS}): take more, with the board tilted to all sides"
+            )
+    known = known_cameras(config, scan)
+    scene = BoardScene(
+        views.views, board.corners_m, views.cameras, views.sizes, board.symmetries,
+        known=known, reference=reference_of(scan, config),
+    )  # fmt: skip
+    with refusals():
+        return start_from_board(scene)
+
+
+def _is_known(config: RigConfig, name: str) -> bool:
+    entry = config.cameras.get(name)
+    return entry is not None and {"fx", "fy"} <= set(entry.params)
+
+
+def problem_of(
+    started: BoardStart, views: BoardViews, board: spec.Board, reference: int
+) -> Problem:
+    """The problem whose frames are those of the start that saw the board."""
+    kept = [(index, views.views[index]) for index in started.kept]
+    frames = sorted({view.frame for _, view in kept})
+    place = {frame: number for number, frame in enumerate(frames)}
+    return board_problem(
+        graph_board(board),
+        seen_corners([view for _, view in kept], [started.corner[i] for i, _ in kept], place),
+        started.cameras,
+        started.cam_from_rig,
+        [started.rig_from_board[frame] for frame in frames],
+        [views.frames[frame] for frame in frames],
+        reference,
+    )
+
+
+def with_lenses(problem: Problem, config: RigConfig) -> Problem:
+    """The problem with the lenses that the configuration gives; others are chosen later."""
+    names = [camera.name for camera in problem.initial.cameras]
+    open_to_choice = set(on_ladder(config, names))
+    cameras = tuple(
+        camera
+        if index in open_to_choice
+        else fit_lens(camera, lens_of(config, camera.name, len(names)))[0]
+        for index, camera in enumerate(problem.initial.cameras)
+    )
+    return replace(problem, initial=replace(problem.initial, cameras=cameras))
+
+
+def seen_corners(
+    views: Sequence[BoardView], corners: Sequence[IntArray], place: dict[int, int]
+) -> SeenCorners:
+    """All corners of some views, renumbered; `place`: of each frame among the problem's."""
+    lengths = [len(view.pixels) for view in views]
+    return SeenCorners(
+        np.concatenate([view.pixels for view in views]),
+        np.repeat([place[view.frame] for view in views], lengths),
+        np.repeat([view.camera for view in views], lengths),
+        np.concatenate(list(corners)),
+        np.concatenate([view.sigma_px for view in views]),
+    )
+
+
+def left_out(started: BoardStart, views: BoardViews) -> tuple[str, ...]:
+    """Views of the board that were not used, and why."""
+    return tuple(
+        f"{views.cameras[views.views[one.view].camera]}/"
+        f"{views.frames[views.views[one.view].frame]}: {one.reason}"
+        for one in started.dropped
+    )
+
+
+def repeated(started: BoardStart, views: BoardViews, board: spec.Board) -> tuple[str, ...]:
+    """Groups of frames in which the board lies alike, in words."""
+    kept = [views.views[index] for index in started.kept]
+    groups = redundant(kept, len(board.corners_m), views.sizes)
+    return tuple(some([views.frames[frame] for frame in group]) for group in groups)
