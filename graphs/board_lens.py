@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from graphs.camera import Camera, fit_lens, nominal_params, project_jacobian
+from graphs.camera import Camera, fit_lens, nominal_params, project_jacobian, unproject
 from graphs.frames import FloatArray
 from graphs.lenses import LENSES, IntArray, LensName
 from graphs.planar import (
@@ -39,6 +39,8 @@ FIELDS_DEG: dict[LensName, tuple[float, float, int]] = {
 }
 SWEEP_ITERATIONS = 5
 REFINE_ITERATIONS = 40
+PLACED_ANEW = 3  # times at most
+WIDEST_DEG = 75.0  # off axis, beyond which no lens on a plane is fitted
 # Soft knowledge, so that what the views leave open stays sane: the focal length in image widths,
 # its factor; the principal point from the centre in image widths; the distortion at the corner.
 FOCAL_WIDTHS, FOCAL_FACTOR = 1.0, 2.0
@@ -69,19 +71,51 @@ def start_lens(name: str, size: tuple[int, int], corners: Corners, lens: LensCho
     `kannala_brandt`, whichever the views fit.
     """
     corners = replace(corners, camera=np.zeros(len(corners.camera), dtype=np.int64))
-    families = FAMILIES if lens == "auto" else (FAMILIES[int(LENSES[lens].wide)],)
-    found = [_refined(*_sweep(name, size, corners, family), corners) for family in families]
-    best = found[0]
-    if len(found) == 2:
-        scores = _scores(corners, np.stack([each.rms_px for each in found]))
-        best = found[int(scores[1] < scores[0] - CLEARLY_BETTER * len(corners.view))]
-    camera = best.camera if lens in ("auto", best.camera.lens) else _as_lens(best.camera, lens)
+    found = {family: _refined(*_sweep(name, size, corners, family), corners) for family in FAMILIES}
+    for family, other in zip(FAMILIES, FAMILIES[::-1], strict=True):
+        # Strong distortion misleads a family's sweep, or its refinement ends in another valley.
+        again = _refined(_translated(found[other].camera, family, corners), None, corners)
+        found[family] = min(found[family], again, key=lambda each: _score(corners, each.rms_px))
+    best = _chosen(found, corners) if lens == "auto" else found[FAMILIES[int(LENSES[lens].wide)]]
+    camera = best.camera if lens == "auto" else _as_lens(best.camera, lens)
     weak = bool(best.focal_sigma > WEAK_FOCAL)
     return LensStart(camera, float(np.median(best.rms_px)), best.focal_sigma, weak)
 
 
 def _as_lens(camera: Camera, lens: LensName) -> Camera:
+    if lens == camera.lens:
+        return camera
     return fit_lens(camera, lens, set(LENSES[lens].coefficients) & {"k1", "k2", "alpha", "xi"})[0]
+
+
+def _chosen(found: dict[LensName, _Refined], corners: Corners) -> _Refined:
+    plain, wide = (found[family] for family in FAMILIES)
+    scores = _scores(corners, np.stack([plain.rms_px, wide.rms_px]))
+    return wide if scores[1] < scores[0] - CLEARLY_BETTER * len(corners.view) else plain
+
+
+def _translated(camera: Camera, family: LensName, corners: Corners) -> Camera:
+    """The camera of the other family that is nearest where the corners are: linear least squares
+    of pixel radii by odd powers of the angle, or of its tangent."""
+    rays = unproject(camera, corners.pixels)
+    with np.errstate(invalid="ignore"):
+        angle = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+        seen = angle < (np.pi if LENSES[family].wide else np.radians(WIDEST_DEG))
+    radius_px = np.linalg.norm(corners.pixels - camera.params[2:4], axis=1)[seen]
+    radius = angle[seen] if LENSES[family].wide else np.tan(angle[seen])
+    design = radius[:, None] ** np.array([1, 3, 5])
+    size = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
+    terms = np.linalg.lstsq(design / size, radius_px, rcond=1e-6)[0] / size
+    if not terms[0] > 0:
+        terms = np.array([camera.params[0], 0.0, 0.0])
+    params = nominal_params(family, camera.size, float(terms[0]))
+    params[2:4], params[4:6] = camera.params[2:4], terms[1:] / terms[0]
+    return replace(camera, lens=family, params=params)
+
+
+def _score(corners: Corners, rms: FloatArray) -> float:
+    """Log of the error, views far worse than the rest counting little."""
+    return float(np.log(np.maximum(rms, SMALLEST_RMS_PX)) @ corners.counts)
 
 
 def _scores(corners: Corners, rms: FloatArray) -> FloatArray:
@@ -101,10 +135,10 @@ def _sweep(
     """The focal length under which the boards of all views fit best, and where they are then."""
     low, high, count = FIELDS_DEG[family]
     wide = LENSES[family].wide
-    ends = np.radians(np.array([low, high])) / 2
-    ends = max(size) / 2 / (ends if wide else np.tan(ends))
+    half = np.radians(np.array([low, high])) / 2
+    ends = max(size) / 2 / (half if wide else np.tan(half))
     cameras, boards, rms = [], [], []
-    for focal_px in np.geomspace(*ends, count):
+    for focal_px in np.geomspace(ends[0], ends[1], count):
         camera = Camera(name, family, size, nominal_params(family, size, focal_px))
         start = linear_transforms(corners, _undistorted_rays(camera, corners.pixels, wide))
         scene = Scene.of_lone_views([camera], corners)
@@ -138,13 +172,20 @@ class _Refined:
     focal_sigma: float  # relative
 
 
-def _refined(start: Camera, boards: Transforms, corners: Corners) -> _Refined:
-    """Lens and boards together; once more with those boards that fit better turned over."""
-    once = _refine(start, boards, corners)
-    both = solve_views([once.camera], corners, once.boards)
-    if np.all(both.first_rms_px > 0.99 * once.rms_px):
-        return once
-    return _refine(once.camera, both.first, corners)
+def _refined(start: Camera, boards: Transforms | None, corners: Corners) -> _Refined:
+    """Lens and boards together; again while boards placed anew, or turned over, fit better."""
+    if boards is None:
+        boards = solve_views([start], corners).first
+    result = _refine(start, boards, corners)
+    for _ in range(PLACED_ANEW):
+        both = (solve_views([result.camera], corners, near) for near in (result.boards, None))
+        near, anew = both
+        better = near.first.where(near.first_rms_px <= anew.first_rms_px, anew.first)
+        rms = np.minimum(near.first_rms_px, anew.first_rms_px)
+        if np.all(rms > 0.99 * result.rms_px):
+            break
+        result = _refine(result.camera, better, corners)
+    return result
 
 
 @dataclass(frozen=True)

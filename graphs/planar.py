@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class Transforms:
     def __len__(self) -> int:
         return len(self.rotation)
 
-    def __getitem__(self, which: NDArray[np.generic] | slice) -> Transforms:
+    def __getitem__(self, which: Any) -> Transforms:
         return Transforms(self.rotation[which], self.translation[which])
 
     def __matmul__(self, other: Transforms) -> Transforms:
@@ -344,7 +344,7 @@ def turned_over(corners: Corners, cam_from_board: Transforms) -> Transforms:
     """The board mirrored through the plane across its line of sight: the other minimum's start."""
     centre = corners.means(corners.board)
     middle = np.einsum("vij,vj->vi", cam_from_board.rotation, centre) + cam_from_board.translation
-    sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    sight = middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
     mirror = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
     first_two = mirror @ cam_from_board.rotation[:, :, :2]
     third = np.cross(first_two[:, :, 0], first_two[:, :, 1])
