@@ -15,11 +15,11 @@ from graphs.lenses import IntArray
 from graphs.planar import Corners, Scene, Transforms, fit
 
 # Boards and cameras are placed in turn; each round about halves what is left of the error.
-ROUNDS = 6
+ROUNDS, PASSES = 4, 2
 FIT_ITERATIONS = 5
 OUTLYING = 3.0  # times the median rms: a view's weight falls to a quarter there
 # A view so much worse than the rig's median was taken at another time, or its corners are wrong.
-ODD_TIMES, ODD_PX = 6.0, 2.0
+ODD_TIMES, ODD_WIDTHS = 6.0, 0.003  # the latter of the image width
 
 
 @dataclass(frozen=True)
@@ -50,24 +50,78 @@ def resolve_frames(
     """
     rig = Transforms.of(cam_from_rig)
     frames, group = np.unique(frame, return_inverse=True)
-    boards, chosen, apart = _choose(rig, corners, group, candidates)
-    renumbering = candidates.renumbering[chosen]
-    rows = np.arange(len(corners.view))
-    corners = replace(corners, board=renumbered[renumbering[corners.view], rows])
-    typical = float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
-    trusted = apart < min(max(AGREEING, TIMES_MEDIAN * typical), FARTHEST)
-    weight = trusted.astype(np.float64)
-    boards, rms = _place_boards(cameras, rig, corners, group, boards, weight)
-    for _ in range(ROUNDS if len(cameras) > 1 else 0):
-        weight = np.where(trusted, _view_weights(rms, trusted), 0.0)
-        rig, boards = _place_cameras(cameras, rig, corners, group, boards, weight, reference)
-        boards, rms = _place_boards(cameras, rig, corners, group, boards, weight)
-    odd = rms > max(ODD_PX, ODD_TIMES * float(np.median(rms)))
-    if np.any(odd & trusted):
-        keep = np.where(odd, 0.0, 1.0)
-        keep = np.where(np.bincount(group, weights=keep)[group] > 0, keep, 1.0)
-        boards, rms = _place_boards(cameras, rig, corners, group, boards, keep)
+    for _ in range(PASSES if len(cameras) > 1 else 1):
+        boards, chosen, apart = _choose(rig, corners, group, candidates)
+        renumbering = candidates.renumbering[chosen]
+        board = renumbered[renumbering[corners.view], np.arange(len(corners.view))]
+        seen = _Seen(cameras, replace(corners, board=board), group)
+        rig, boards, rms = _settle(seen, rig, boards, _trusted(apart), reference)
+    widths = np.array([camera.size[0] for camera in cameras])[corners.camera]
+    most = np.maximum(ODD_WIDTHS * widths, ODD_TIMES * float(np.median(rms)))
+    boards, rms, odd = _without_odd(seen, rig, boards, rms, most)
     return RigFrames(rig, boards, frames, renumbering, rms, odd)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    cameras: Sequence[Camera]
+    corners: Corners  # of the boards as renumbered
+    group: IntArray  # (n_views,) place of each view's frame
+
+
+def _trusted(apart: FloatArray) -> NDArray[np.bool_]:
+    """Views (n_views,) near enough to where their frame's other views have the board."""
+    typical = float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
+    return apart < min(max(AGREEING, TIMES_MEDIAN * typical), FARTHEST)
+
+
+def _settle(
+    seen: _Seen, rig: Transforms, boards: Transforms, trusted: NDArray[np.bool_], reference: int
+) -> tuple[Transforms, Transforms, FloatArray]:
+    """Cameras, boards and the rms of all views, boards and cameras placed in turn."""
+    boards, rms = _place_boards(seen, rig, boards, trusted.astype(np.float64))
+    for _ in range(ROUNDS if len(seen.cameras) > 1 else 0):
+        weight = np.where(trusted, _view_weights(rms, trusted), 0.0)
+        rig, boards = _place_cameras(seen, rig, boards, weight, reference)
+        boards, rms = _place_boards(seen, rig, boards, weight)
+    return rig, boards, rms
+
+
+def _without_odd(
+    seen: _Seen, rig: Transforms, boards: Transforms, rms: FloatArray, most: FloatArray
+) -> tuple[Transforms, FloatArray, NDArray[np.bool_]]:
+    """Boards and rms without the views whose removal lets the rest of their frame agree."""
+    odd = np.zeros(len(rms), dtype=bool)
+    rotation, translation, rms = boards.rotation.copy(), boards.translation.copy(), rms.copy()
+    for number in np.unique(seen.group[rms > most]):
+        views = np.flatnonzero(seen.group == number)
+        part = _Seen(seen.cameras, seen.corners.of_views(views), np.zeros(len(views), np.int64))
+        board, kept = boards[number : number + 1], np.ones(len(views), dtype=bool)
+        error = rms[views]
+        while kept.sum() > 1 and np.any(error[kept] > most[views][kept]):
+            board, kept, error = _one_fewer(part, rig, board, kept, most[views])
+        rotation[number], translation[number] = board.rotation[0], board.translation[0]
+        odd[views], rms[views] = ~kept, error
+    return Transforms(rotation, translation), rms, odd
+
+
+def _one_fewer(
+    part: _Seen, rig: Transforms, board: Transforms, kept: NDArray[np.bool_], most: FloatArray
+) -> tuple[Transforms, NDArray[np.bool_], FloatArray]:
+    """One frame without the view whose removal helps most; among equals that of fewest corners."""
+    tried = []
+    for view in np.flatnonzero(kept):
+        rest = kept.copy()
+        rest[view] = False
+        placed, rms = _place_boards(part, rig, board, rest.astype(np.float64))
+        wrong = int((rms[rest] > most[rest]).sum())
+        tried.append(
+            ((wrong, int(part.corners.counts[view]), float(rms[rest].max())), view, placed, rms)
+        )
+    _, view, placed, rms = min(tried, key=lambda each: each[0])
+    rest = kept.copy()
+    rest[view] = False
+    return placed, rest, rms
 
 
 def _view_weights(rms: FloatArray, trusted: NDArray[np.bool_]) -> FloatArray:
@@ -111,42 +165,26 @@ def _choose(
 
 
 def _place_boards(
-    cameras: Sequence[Camera],
-    rig: Transforms,
-    corners: Corners,
-    group: IntArray,
-    boards: Transforms,
-    weight: FloatArray,
+    seen: _Seen, rig: Transforms, boards: Transforms, weight: FloatArray
 ) -> tuple[Transforms, FloatArray]:
     """rig_from_board of each frame with the cameras held, and the rms of all views."""
-    scene = Scene(cameras, corners.weighted(weight), corners.board, group, rig[corners.camera])
+    corners = seen.corners
+    scene = Scene(
+        seen.cameras, corners.weighted(weight), corners.board, seen.group, rig[corners.camera]
+    )
     placed, _ = fit(scene, boards, FIT_ITERATIONS)
-    return placed, _rms(replace(scene, corners=corners), placed)
-
-
-def _rms(scene: Scene, a_from_b: Transforms) -> FloatArray:
-    return fit(scene, a_from_b, 0)[1]
+    return placed, fit(replace(scene, corners=corners), placed, 0)[1]
 
 
 def _place_cameras(
-    cameras: Sequence[Camera],
-    rig: Transforms,
-    corners: Corners,
-    group: IntArray,
-    boards: Transforms,
-    weight: FloatArray,
-    reference: int,
+    seen: _Seen, rig: Transforms, boards: Transforms, weight: FloatArray, reference: int
 ) -> tuple[Transforms, Transforms]:
     """cam_from_rig of each camera with the boards held, and both seen from the reference."""
-    at = boards[group[corners.view]]
+    corners = seen.corners
+    at = boards[seen.group[corners.view]]
     points = np.einsum("nij,nj->ni", at.rotation, corners.board) + at.translation
-    scene = Scene(
-        cameras,
-        corners.weighted(weight),
-        points,
-        corners.camera,
-        Transforms.identities(len(group)),
-    )
+    alone = Transforms.identities(len(seen.group))
+    scene = Scene(seen.cameras, corners.weighted(weight), points, corners.camera, alone)
     placed, _ = fit(scene, rig, FIT_ITERATIONS)
     own = placed[reference : reference + 1]
     return placed @ own.inverse, own @ boards

@@ -37,7 +37,7 @@ SMALLEST_SPREAD_PX = 3.0  # rms across the narrower side: neighbours are about 3
 # Corners that no homography explains, relative to their spread: shuffled ones reach 0.5 and more,
 # an equidistant lens of 180 degrees filled by the board 0.1.
 SCRAMBLED = 0.25
-FAR_TIMES, FAR_PX = 5.0, 1.0  # a view's rms beside its camera's median: corners are wrong
+FAR_TIMES, FAR_PX, FAR_WIDTHS = 5.0, 1.0, 0.001  # times the camera's median, and at least that
 STEEPEST_DEG = 80.0  # between line of sight and the board's normal; corners blur together there
 # The second solution's squared error, in noise variances above the first's: less may be chance.
 AMBIGUOUS_CHI2, AMBIGUOUS_RATIO, AMBIGUOUS_DEG = 25.0, 1.15, 15.0
@@ -118,7 +118,9 @@ def start_from_board(scene: BoardScene) -> BoardStart:
     lenses = tuple(_lens(scene, corners, views, index) for index in range(len(scene.names)))
     cameras = tuple(each.camera for each in lenses)
     both = solve_views(cameras, corners)
-    good = _judge(corners, both, views, dropped)
+    _drop_misdetected(cameras, corners, both, views, dropped)
+    _drop_oblique(corners, both, views, dropped)
+    good = np.array([i for i, v in enumerate(views) if int(v) not in dropped], dtype=np.int64)
     views, corners, both = views[good], corners.of_views(good), _of_views(both, good)
     _check_seen(scene, views, dropped)
     frame = np.array([scene.views[v].frame for v in views])
@@ -204,31 +206,41 @@ def _drop_scrambled(scene: BoardScene, views: IntArray, dropped: dict[int, Dropp
         )
 
 
-def _judge(
-    corners: Corners, both: BothSolutions, views: IntArray, dropped: dict[int, DroppedView]
-) -> IntArray:
-    """Indices of views that fit their camera as well as the others do, and are not too oblique."""
+def _drop_misdetected(
+    cameras: Sequence[Camera],
+    corners: Corners,
+    both: BothSolutions,
+    views: IntArray,
+    dropped: dict[int, DroppedView],
+) -> None:
+    """Drop views that fit their camera far worse than its others do."""
     rms = both.first_rms_px
-    middle = corners.means(corners.board)
-    sight = np.einsum("vij,vj->vi", both.first.rotation, middle) + both.first.translation
-    cosine = np.abs((sight * both.first.rotation[:, :, 2]).sum(1)) / np.linalg.norm(sight, axis=1)
-    tilt_deg = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
-    for camera in np.unique(corners.camera):
-        own = views_of(corners, int(camera))
+    for index, camera in enumerate(cameras):
+        own = views_of(corners, index)
         median = float(np.median(rms[own]))
-        for place in own[rms[own] > max(FAR_TIMES * median, FAR_PX)]:
+        most = max(FAR_TIMES * median, FAR_PX, FAR_WIDTHS * camera.size[0])
+        for place in own[rms[own] > most]:
             _drop_at(
                 dropped, views, place, "misdetected",
                 f"its reprojection rms of {rms[place]:.1f} px is {rms[place] / median:.0f} times "
                 f"the camera's median of {median:.2f} px: corners are wrong",
             )  # fmt: skip
+
+
+def _drop_oblique(
+    corners: Corners, both: BothSolutions, views: IntArray, dropped: dict[int, DroppedView]
+) -> None:
+    middle = corners.means(corners.board)
+    rotation = both.first.rotation
+    sight = np.einsum("vij,vj->vi", rotation, middle) + both.first.translation
+    cosine = np.abs((sight * rotation[:, :, 2]).sum(1)) / np.linalg.norm(sight, axis=1)
+    tilt_deg = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
     for place in np.flatnonzero(tilt_deg > STEEPEST_DEG):
         _drop_at(
             dropped, views, place, "oblique",
             f"the board is seen {tilt_deg[place]:.0f} degrees from its front (most "
             f"{STEEPEST_DEG:.0f})",
         )  # fmt: skip
-    return np.array([i for i, v in enumerate(views) if int(v) not in dropped], dtype=np.int64)
 
 
 def _drop_at(

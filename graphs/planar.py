@@ -112,7 +112,7 @@ class Corners:
 
     def means(self, values: FloatArray) -> FloatArray:
         """Weighted means of values (n, k) over the corners of each view (n_views, k)."""
-        weights = self.sums(self.weight)[:, None]
+        weights = np.maximum(self.sums(self.weight), 1e-300)[:, None]
         mean: FloatArray = self.sums(self.weight[:, None] * values) / weights
         return mean
 
