@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +75,7 @@ def read_scan(
     if not files:
         videos = video.find_videos(scan)
         if not videos:
-            raise CalibrationError(_nothing_in(scan))
+            raise CalibrationError(nothing_in(scan))
         inputs = [{name: sha256(path) for name, path in videos.items()}, video_frames]
         root = cache.stage(
             "frames", inputs, lambda place: video.unpack(videos, place, video_frames, progress)
@@ -105,7 +105,8 @@ def camera_names(scan: Path) -> tuple[str, ...]:
     return tuple(find_images(scan) or (videos if len(videos) > 1 else (LONE_CAMERA,)))
 
 
-def _nothing_in(scan: Path) -> str:
+def nothing_in(scan: Path) -> str:
+    """What to tell of a scan without images and videos."""
     if scan.is_file():
         return (
             f"{scan} is no video: give a folder of images or a video file "
@@ -204,31 +205,52 @@ def _whole_jpeg(data: bytes) -> bool:
 def _check_files(
     root: Path, files: dict[str, list[Path]], progress: Progress
 ) -> tuple[dict[str, list[Path]], tuple[str, ...], dict[str, tuple[int, int]]]:
-    total = sum(map(len, files.values()))
-    done, warnings = 0, []
+    warnings = []
     readable: dict[str, list[Path]] = {}
     sizes: dict[str, tuple[int, int]] = {}
+    for camera, path, size in measured_sizes(files, progress):
+        if size is None:
+            warnings.append(skipped(root, path))
+            continue
+        first = sizes.setdefault(camera, size)
+        if size != first:
+            raise CalibrationError(
+                f"camera {camera}: {path.name} is {size[0]}x{size[1]} and "
+                f"{readable[camera][0].name} is {first[0]}x{first[1]}; one camera has one "
+                "image size: remove the odd images or give them a folder of their own"
+            )
+        readable.setdefault(camera, []).append(path)
+    check_cameras_remain(root, files, readable)
+    return readable, tuple(warnings), sizes
+
+
+def measured_sizes(
+    files: dict[str, list[Path]], progress: Progress
+) -> Iterator[tuple[str, Path, tuple[int, int] | None]]:
+    """Every image's camera, path and (width, height); None where it cannot be decoded whole."""
+    total, done = sum(map(len, files.values())), 0
     with ThreadPoolExecutor(max_workers=2) as pool:
         for camera, paths in files.items():
             for path, size in zip(paths, pool.map(image_size, paths), strict=True):
                 progress("reading images", done := done + 1, total)
-                if size is None:
-                    warnings.append(f"{path.relative_to(root)} is unreadable or truncated: skipped")
-                    continue
-                first = sizes.setdefault(camera, size)
-                if size != first:
-                    raise CalibrationError(
-                        f"camera {camera}: {path.name} is {size[0]}x{size[1]} and "
-                        f"{readable[camera][0].name} is {first[0]}x{first[1]}; one camera has one "
-                        "image size: remove the odd images or give them a folder of their own"
-                    )
-                readable.setdefault(camera, []).append(path)
+                yield camera, path, size
+
+
+def skipped(root: Path, path: Path) -> str:
+    """The warning of an image that cannot be decoded."""
+    return f"{path.relative_to(root)} is unreadable or truncated: skipped"
+
+
+def check_cameras_remain(
+    root: Path, files: dict[str, list[Path]], readable: Mapping[str, object]
+) -> None:
+    """Raises CalibrationError for a camera that has files, and none of them readable."""
     if not readable:
+        total = sum(map(len, files.values()))
         raise CalibrationError(f"none of the {total} images in {root} can be decoded")
     lost = sorted(set(files) - set(readable))
     if lost:
         raise CalibrationError(f"camera {lost[0]}: none of its images can be decoded")
-    return readable, tuple(warnings), sizes
 
 
 def _number_images(
@@ -239,6 +261,22 @@ def _number_images(
     matching: Literal["stem", "order"],
     warnings: tuple[str, ...],
 ) -> Scan:
+    named, doubts = name_frames(found, files, matching)
+    _check_shared_frames({camera: {stem for stem, _ in named[camera]} for camera in named})
+    every = {stem for entries in named.values() for stem, _ in entries}
+    frames = tuple(sorted(every, key=counting_order))
+    return number_images(root, named, frames, sizes, warnings + doubts)
+
+
+def name_frames(
+    found: dict[str, list[Path]],
+    files: dict[str, list[Path]],
+    matching: Literal["stem", "order"],
+) -> tuple[dict[str, list[tuple[str, Path]]], tuple[str, ...]]:
+    """The frame and path of each camera's readable `files`, among all `found`; and warnings.
+
+    Raises CalibrationError when a camera has two images of one frame.
+    """
     named = {
         camera: list(zip(_frame_names(found[camera], matching), found[camera], strict=True))
         for camera in files
@@ -255,13 +293,23 @@ def _number_images(
                 f"camera {camera} has {count} images called {stem} (with different endings), "
                 "which would be one frame: remove or rename all but one"
             )
-    _check_shared_frames({camera: {stem for stem, _ in named[camera]} for camera in named})
     counts = {camera: len(paths) for camera, paths in found.items()}
     if matching == "order" and len(set(counts.values())) > 1:
         listed = ", ".join(f"{camera} {count}" for camera, count in counts.items())
-        warnings += (f"cameras have different numbers of images ({listed}): is their order right?",)
-    every = {stem for entries in named.values() for stem, _ in entries}
-    frames = tuple(sorted(every, key=counting_order))
+        return named, (
+            f"cameras have different numbers of images ({listed}): is their order right?",
+        )
+    return named, ()
+
+
+def number_images(
+    root: Path,
+    named: Mapping[str, list[tuple[str, Path]]],
+    frames: tuple[str, ...],
+    sizes: Mapping[str, tuple[int, int]],
+    warnings: tuple[str, ...],
+) -> Scan:
+    """A scan of each camera's images, given with the frame each belongs to, one of `frames`."""
     index = {stem: number for number, stem in enumerate(frames)}
     images = tuple(
         ScanImage(number, index[stem], path.relative_to(root).as_posix())

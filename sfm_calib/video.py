@@ -18,6 +18,7 @@ ANALYSIS_WIDTH = 320  # px; motion and sharpness need no more
 # A tenth of the width between picked frames keeps nine tenths in common for matching.
 MOTION_STEP = 0.08  # of the image width
 LEAST_MOTION = 3 * MOTION_STEP  # three views are the fewest that determine a focal length
+FEWEST_FRAMES = 3  # fewer are no video
 GrayImage = NDArray[np.uint8]
 
 
@@ -87,9 +88,14 @@ def pick_frames(
     and the sharpest frame (n,) of each is taken."""
     travelled = np.cumsum(motion)
     n_stretches = int(np.clip(np.ceil(travelled[-1] / MOTION_STEP), 3, max_frames))
-    stretch = np.minimum(
-        (travelled / max(travelled[-1], 1e-9) * n_stretches).astype(int), n_stretches - 1
-    )
+    return sharpest_of_stretches(travelled / max(travelled[-1], 1e-9), sharpness, n_stretches)
+
+
+def sharpest_of_stretches(
+    travelled: NDArray[np.float64], sharpness: NDArray[np.float64], n_stretches: int
+) -> list[int]:
+    """The sharpest (n,) of each of equal stretches of a path (n,), given as shares of its whole."""
+    stretch = np.minimum((travelled * n_stretches).astype(int), n_stretches - 1)
     return [
         int(members[sharpness[members].argmax()])
         for number in range(n_stretches)
@@ -115,11 +121,16 @@ def _analyse(
         previous = small
         progress(f"scanning {path.name}", len(motion), max(total, len(motion)))
     capture.release()
-    if len(motion) < 3:
-        raise CalibrationError(
-            f"{path} gave {len(motion)} frames: it is damaged, or in a format OpenCV cannot decode"
-        )
+    check_decoded(path, len(motion))
     return np.array(motion), np.array(sharpness)
+
+
+def check_decoded(path: Path, n_frames: int) -> None:
+    """Raises CalibrationError when a video gave next to nothing."""
+    if n_frames < FEWEST_FRAMES:
+        raise CalibrationError(
+            f"{path} gave {n_frames} frames: it is damaged, or in a format OpenCV cannot decode"
+        )
 
 
 def _small_gray(frame: NDArray[np.uint8]) -> GrayImage:
@@ -153,6 +164,11 @@ def _write_frames(
         progress(f"unpacking {path.name}", number + 1, last + 1)
         if number not in picked:
             continue
-        if not cv2.imwrite(str(folder / f"{number:06d}.png"), frame):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # OpenCV does not say why
+        write_image(folder / f"{number:06d}.png", frame)
     capture.release()
+
+
+def write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write an image; raises OSError when it cannot be written."""
+    if not cv2.imwrite(str(path), pixels):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # OpenCV does not say why
