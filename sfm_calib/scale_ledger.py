@@ -86,7 +86,7 @@ def _of_one(ledger: ScaleLedger) -> str:
     agree = ", and without it they agree" if len(others) > 1 else ""
     return (
         f"the {wrong.name} of {_metres(wrong.measured_m, wrong.sigma_m)} contradicts {whom}: by "
-        f"them it is {_predicted(wrong)} (z {abs(wrong.z or 0.0):.1f}){agree}; measure it again, or "
+        f"them it is {_predicted(wrong)} (z {abs(wrong.z or 0.0):.1f}){agree}; measure it again or "
         f"take it out of rig.yaml; {COMPROMISE}"
     )
 
