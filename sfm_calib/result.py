@@ -54,11 +54,33 @@ class CamFromRig(Record):
     sigma_translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+class ScaleEntry(Record):
+    """A measured length, what the solve made of it, and what all others say of it."""
+
+    what: str
+    measured_m: float
+    sigma_m: float  # as stated
+    estimated_m: float
+    residual_percent: float  # estimated less measured
+    predicted_by_others_m: float | None = None  # None: nothing else tells
+    sigma_predicted_m: float | None = None
+    z: float | None = None  # measured less predicted, in sigmas of that difference
+    p_value: float | None = None  # of a larger |z|, if the sigmas are true
+    contradicts: bool = False
+    suspect: bool = False  # without it the others agree with each other
+
+    @property
+    def residual_m(self) -> float:
+        return self.estimated_m - self.measured_m
+
+
 class Scale(Record):
     """What gives the rig's lengths their unit."""
 
     source: str  # what gave the unit of length
     sigma_relative: float | None = None  # None: no metric scale
+    contradicted: bool = False  # the sources contradict each other: lengths are a compromise
+    ledger: tuple[ScaleEntry, ...] = ()  # every source; none: no metric scale, or an older file
 
 
 class RigResult(Record):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from graphs.ladder import Ladder
 from graphs.refine import Refinement
+from graphs.scale_ledger import NO_SOURCES, ScaleLedger
 from graphs.split_check import SplitCheck
 from graphs.stated_covariance import CalibrationCovariance
 from graphs.twin import Certificate
@@ -41,3 +42,4 @@ class Run:
     split: SplitCheck | None = None
     certificate: Certificate | None = None
     board: BoardUse | None = None
+    ledger: ScaleLedger = NO_SOURCES

@@ -23,6 +23,7 @@ from sfm_calib import result
 from sfm_calib.board_summary import board_result
 from sfm_calib.run import Run
 from sfm_calib.scale import in_words
+from sfm_calib.scale_ledger import entries_of, ledger_of
 from sfm_calib.uncertainty import uncertainty_of
 from sfm_calib.verdict import verdict_of
 
@@ -34,6 +35,7 @@ def summarise(run: Run) -> tuple[result.Calibration, float]:
 
     Non-metric rigs are put into units of their longest baseline.
     """
+    run = replace(run, ledger=ledger_of(run))
     estimate = run.refinement.estimate
     covariance, unit = run.covariance.stated, 1 / run.covariance.basis.unit
     in_unit = estimate.scaled(unit)
@@ -211,6 +213,8 @@ def _scale(run: Run) -> result.Scale:
     return result.Scale(
         source=f"{best}, and {others} more" if others else best,
         sigma_relative=sum(sigma**-2 for sigma in sigmas) ** -0.5,
+        contradicted=run.ledger.contradicted,
+        ledger=entries_of(run.ledger),
     )
 
 

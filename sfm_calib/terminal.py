@@ -117,6 +117,7 @@ def print_result(calibration: Calibration, console: Console) -> None:
         console.print(table)
     if len(calibration.cameras) > 1:
         _print_rig(calibration, console)
+    _print_ledger(calibration, console)
     _print_lens_choice(calibration, console)
     _print_board(calibration, console)
     _print_basis(calibration, console)
@@ -250,6 +251,32 @@ def _print_rig(calibration: Calibration, console: Console) -> None:
                 ),
                 end_section=axis == 2,
             )
+    console.print(table)
+
+
+def _print_ledger(calibration: Calibration, console: Console) -> None:
+    """Measured lengths that test each other, a source a row."""
+    ledger = calibration.rig.scale.ledger
+    if len(ledger) < 2:
+        return
+    wrong = calibration.rig.scale.contradicted
+    _print_line(
+        console, f"{len(ledger)} measured lengths {'CONTRADICT each other' if wrong else 'agree'}"
+    )
+    table = _table("", "measured m", "sigma", "found", "by the others", "sigma", "z")
+    for entry in ledger:
+        predicted, sigma = entry.predicted_by_others_m, entry.sigma_predicted_m
+        told = predicted is not None and sigma is not None
+        table.add_row(
+            entry.what,
+            with_digits(entry.measured_m, entry.sigma_m),
+            sigma_text(entry.sigma_m),
+            with_digits(entry.estimated_m, entry.sigma_m),
+            with_digits(predicted or 0.0, sigma or 0.0) if told else "-",
+            sigma_text(sigma or 0.0) if told else "-",
+            "-" if entry.z is None else f"{entry.z:+.1f}",
+            style="bold red" if entry.contradicts else "",
+        )
     console.print(table)
 
 

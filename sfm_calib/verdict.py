@@ -16,6 +16,7 @@ from sfm_calib import nominal, result
 from sfm_calib.config import PointsConfig
 from sfm_calib.mapping import some
 from sfm_calib.run import Run
+from sfm_calib.scale_ledger import contradiction
 
 FEW_FRAMES = 10  # fewer, and the scatter between frames is itself a guess
 CONTRADICTION = 4.0  # stated sigmas between a parameter and what rig.yaml says of it
@@ -41,6 +42,7 @@ def verdict_of(run: Run) -> result.Verdict:
         reasons.insert(0, f"the solve did not converge: {refinement.summary.reason}")
     certificate = None if run.certificate is None else certificate_of(run.certificate)
     messages = [f"not usable: {reason}" for reason in reasons]
+    messages += contradiction(run.ledger)
     messages += [*run.scan.warnings, *run.mapped.messages, *observed.lacks]
     messages += _doubts(run) + _contradictions(run) + _lost_clicks(run)
     if certificate is not None and not certificate.holds:

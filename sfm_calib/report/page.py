@@ -39,6 +39,7 @@ from sfm_calib.report.rows import (
     rig_tables,
     rows_without_table,
 )
+from sfm_calib.report.scale_ledger import ledger_section
 from sfm_calib.report.scene import rig_figure, scan_figure
 from sfm_calib.report.sigmas import sigma_section
 from sfm_calib.report.theme import Panel, figure_html
@@ -110,6 +111,7 @@ def render(
         lens_tables=lenses,
         ladder=lens_ladder(calibration),
         rig_tables=rig,
+        scale_ledger=ledger_section(calibration),
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
         truth_summary=truth_summary(truth_rows),
