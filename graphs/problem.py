@@ -176,11 +176,11 @@ class Problem:
     @property
     def metric(self) -> bool:
         """Whether lengths of the rig are in metres: measured, or seen against a board."""
-        return bool(self.scales) or self._board_gives_scale
+        return bool(self.scales) or self.board_gives_scale
 
     @property
-    def _board_gives_scale(self) -> bool:
-        # What two cameras see at once, or what stands in the scene itself.
+    def board_gives_scale(self) -> bool:
+        """Whether two cameras see the board at once, or it stands in the scene itself."""
         if self.board is None:
             return False
         seen = self.observations

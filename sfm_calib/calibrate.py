@@ -113,7 +113,7 @@ def options_of(problem: Problem, config: RigConfig) -> GraphOptions:
         loss=loss,
         loss_scale=SCALE_95[loss],
         lens_priors=lens_priors(problem.initial, config),
-        rig_priors=rig_priors(problem.initial, config, problem.reference),
+        rig_priors=rig_priors(problem.initial, config, problem.reference, problem.metric),
         shared_lenses=shared_lenses(problem, config),
     )
 

@@ -199,13 +199,14 @@ def nominal_rig(
     return tuple(given) if len(given) == len(names) else None
 
 
-def rig_priors(start: Estimate, config: RigConfig, reference: int) -> dict[int, RigPrior]:
+def rig_priors(
+    start: Estimate, config: RigConfig, reference: int, metric: bool
+) -> dict[int, RigPrior]:
     """Priors on cam_from_rig, where rig.yaml gives one with a sigma.
 
     Without a metric scale only the rotation can be believed.
     """
     names = [camera.name for camera in start.cameras]
-    metric = bool(config.scale.measured)
     priors = {}
     for index, transform in enumerate(nominal_transforms(config, names, reference)):
         said = camera_config(config, names[index]).cam_from_rig

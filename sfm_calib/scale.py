@@ -156,8 +156,9 @@ def with_scale(problem: Problem, scale: ScaleConfig, min_parallax_deg: float) ->
                 "measure between others"
             )
     best = min(sources, key=lambda source: source.sigma_m / source.length_m)
-    size = best.length_m / length_of(best, problem.initial)
-    problem = replace(problem, initial=problem.initial.scaled(size))
+    if not problem.board_gives_scale:
+        size = best.length_m / length_of(best, problem.initial)
+        problem = replace(problem, initial=problem.initial.scaled(size))
     return with_click_sigma(problem, noise_of(problem))
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from graphs.scale_ledger import LedgerEntry, ScaleLedger, scale_ledger
+import numpy as np
+
+from graphs.boards import shape_of
+from graphs.keys import shape_key
+from graphs.scale_ledger import LedgerEntry, ScaleLedger, SourceRow, scale_ledger
 from sfm_calib.report.digits import decimals_for, number
 from sfm_calib.result import ScaleEntry
 from sfm_calib.run import Run
@@ -21,8 +25,27 @@ def ledger_of(run: Run) -> ScaleLedger:
     problem = refinement.problem
     names = [name_of(source, problem) for source in problem.scales]
     return scale_ledger(
-        refinement.graph, refinement.estimate, refinement.values, names, covariance.inflation
-    )
+        refinement.graph, refinement.estimate, refinement.values, names, covariance.inflation,
+        _of_board(run),
+    )  # fmt: skip
+
+
+def _of_board(run: Run) -> tuple[SourceRow, ...]:
+    """The stated size of the board's squares, where it gives the rig its lengths."""
+    problem, estimate = run.refinement.problem, run.refinement.estimate
+    if problem.board is None or run.board is None or not problem.board_gives_scale:
+        return ()
+    unit_m, relative = run.board.board.unit_m, float(problem.board.board.shape_sigma[0])
+    grown = float(shape_of(estimate, problem.board.board)[0] - problem.board.board.shape_mean[0])
+    layout = run.refinement.graph.layout
+    row = np.zeros(layout.elimination.n_columns)
+    row[layout.columns(shape_key())[0]] = 1 / relative
+    return (
+        SourceRow(
+            f"square of the board ({1e3 * unit_m:g} mm)", unit_m, relative * unit_m,
+            unit_m * float(np.exp(grown)), 0.0, row, grown / relative,
+        ),
+    )  # fmt: skip
 
 
 def entries_of(ledger: ScaleLedger) -> tuple[ScaleEntry, ...]:

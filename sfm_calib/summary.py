@@ -157,7 +157,7 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
 
 
 def _unit_name(run: Run) -> Literal["m", "baseline"] | None:
-    if run.refinement.problem.scales:
+    if run.refinement.problem.metric:
         return "m" if len(run.scan.cameras) > 1 else None
     return None if run.covariance.basis.unit_camera is None else "baseline"
 
@@ -177,7 +177,7 @@ def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) 
         )
     reference = names[problem.reference]
     scale = result.Scale(source="none: one camera has no length")
-    if problem.scales:
+    if problem.metric:
         scale = _scale(run)
     elif far is not None:
         scale = result.Scale(source=f"none: unit is the baseline {reference} to {names[far]}")
@@ -186,7 +186,7 @@ def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) 
     return result.RigResult(
         reference=reference,
         cam_from_rig=transforms,
-        metric=bool(problem.scales),
+        metric=problem.metric,
         scale=scale,
     )
 
@@ -208,7 +208,11 @@ def _scale(run: Run) -> result.Scale:
         / source.length_m
         for source in problem.scales
     ]
-    best = in_words(problem.scales[int(np.argmin(sigmas))], problem)
+    words = [in_words(source, problem) for source in problem.scales]
+    if problem.board is not None and run.board is not None and problem.board_gives_scale:
+        sigmas.append(float(problem.board.board.shape_sigma[0]))
+        words.append(f"board: {run.board.board.described}")
+    best = words[int(np.argmin(sigmas))]
     others = len(sigmas) - 1
     return result.Scale(
         source=f"{best}, and {others} more" if others else best,

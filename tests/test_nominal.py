@@ -72,9 +72,9 @@ def test_half_a_nominal_rig_is_none() -> None:
 
 def test_rig_priors_need_a_sigma_and_translations_a_scale() -> None:
     start = Estimate((camera("a"), camera("b")), (TURN, OTHER), (), np.zeros((0, 3)))
-    assert rig_priors(start, rig(b=entry(OTHER)), 0) == {}
+    assert rig_priors(start, rig(b=entry(OTHER)), 0, False) == {}
     said = rig(a=entry(TURN), b=entry(OTHER, sigma_rotation_deg=2.0, sigma_translation=0.01))
-    prior = rig_priors(start, said, 0)[1]
+    prior = rig_priors(start, said, 0, False)[1]
     expected = OTHER @ TURN.inverse
     np.testing.assert_allclose(prior.cam_from_rig.rotation, expected.rotation, atol=1e-12)
     assert prior.sigma_rotation == pytest.approx(np.radians(2.0))
@@ -83,7 +83,7 @@ def test_rig_priors_need_a_sigma_and_translations_a_scale() -> None:
     path = {"between": ["0", "1"], "length_m": 1, "sigma_m": 0.1}
     for scale in ({"baseline": baseline}, {"frames": path}):
         metric = said.model_copy(update={"scale": ScaleConfig.model_validate(scale)})
-        assert rig_priors(start, metric, 0)[1].sigma_translation == 0.01
+        assert rig_priors(start, metric, 0, True)[1].sigma_translation == 0.01
 
 
 @pytest.mark.parametrize(
