@@ -1,11 +1,16 @@
-"""The description of a calibration target: its pattern, its size, and how well that is known."""
+"""The description of a calibration target: its pattern, its size, and how well that is known.
+
+Every type counts something else, and its YAML key says what: the inner corners of a checkerboard,
+the squares of a ChArUco board, the tags of an AprilGrid, the circles of a grid of circles.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
+import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from graphs.frames import FloatArray
 from graphs.problem import IntArray
@@ -13,40 +18,299 @@ from graphs.problem import IntArray
 BoardType = Literal["checkerboard", "charuco", "aprilgrid", "circles"]
 # Of a length on the board: office printers are off by 0.1 to 0.5 %, good boards by less.
 DEFAULT_RELATIVE_SIGMA = 0.001
+MOST = 100  # of anything along one side of a board
+TAG36H11_IDS = 587  # tags in the family
+DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+
+Length = Annotated[float, Field(gt=0, le=100)]  # m; a larger one is surely in mm
+Count = Annotated[int, Field(ge=2, le=MOST)]
 
 
 class Board(BaseModel):
-    """A flat target. Its frame: origin in corner 0, x along a row, y down a column, z into it."""
+    """A flat target. Its frame: origin in corner 0, x along a row to the right, y down, z into it.
+
+    One of its four types below; what they share is here.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    length_name: ClassVar[str]  # the field with the length that scales the whole board
 
     type: BoardType
-    columns: int = Field(ge=2)  # of corners, squares or tags: see each type
-    rows: int = Field(ge=2)
-    square_m: float = Field(gt=0)  # side of a square; of circles half the distance within a row
-    square_sigma_m: float | None = Field(default=None, gt=0)
+    square_sigma_m: Length | None = None  # of that length, as an error of the whole board's scale
     warp: bool = True  # whether the board may be bent a little
+
+    @property
+    def unit_m(self) -> float:
+        """The length that scales the board: of a square, a tag, or between circles."""
+        return float(getattr(self, self.length_name))
 
     @property
     def relative_sigma(self) -> float:
         """Of every length on the board, relative."""
         if self.square_sigma_m is None:
             return DEFAULT_RELATIVE_SIGMA
-        return self.square_sigma_m / self.square_m
+        return self.square_sigma_m / self.unit_m
 
     @property
     def corners_m(self) -> FloatArray:
-        """Corners (n, 3) in the board's frame, row by row; z = 0."""
-        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
-        result: FloatArray = grid * self.square_m
-        return result
+        """Corners (n, 3) in the board's frame, in the order of their numbers; z = 0."""
+        raise NotImplementedError
 
     @property
     def symmetries(self) -> tuple[IntArray, ...]:
         """Renumberings (n,) of the corners under which the pattern looks the same, the identity
         left out: corner i may as well be corner renumbering[i]."""
-        # The half turn of a checkerboard with an odd sum of inner corners swaps black and white.
-        if self.type == "checkerboard" and (self.columns + self.rows) % 2 == 0:
-            return (np.arange(self.columns * self.rows)[::-1],)
         return ()
+
+    @property
+    def columns(self) -> int:
+        """Corners in a row."""
+        raise NotImplementedError
+
+    @property
+    def rows(self) -> int:
+        """Corners in a column."""
+        raise NotImplementedError
+
+    @property
+    def described(self) -> str:
+        """The board in a few words, as messages call it."""
+        raise NotImplementedError
+
+
+class Checkerboard(Board):
+    """A checkerboard, known by its inner corners, where four squares meet.
+
+    Where the numbers of columns and rows tell a side by its colour, the square before corner 0 is
+    black.
+    """
+
+    length_name = "square_m"
+
+    type: Literal["checkerboard"] = "checkerboard"
+    inner_corners: tuple[Count, Count]  # in a row, in a column
+    square_m: Length
+
+    @property
+    def columns(self) -> int:
+        return self.inner_corners[0]
+
+    @property
+    def rows(self) -> int:
+        return self.inner_corners[1]
+
+    @property
+    def corners_m(self) -> FloatArray:
+        return _grid(self.columns, self.rows) * self.square_m
+
+    @property
+    def symmetries(self) -> tuple[IntArray, ...]:
+        numbers = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        if (self.columns + self.rows) % 2:
+            return ()  # a half turn swaps black and white
+        half = np.rot90(numbers, 2).ravel()
+        if self.columns != self.rows or self.columns % 2:
+            return (half,)  # so does a quarter turn of a square board of odd counts
+        return (np.rot90(numbers, 1).ravel(), half, np.rot90(numbers, 3).ravel())
+
+    @property
+    def described(self) -> str:
+        return f"a checkerboard of {self.columns} x {self.rows} inner corners"
+
+
+class Charuco(Board):
+    """A checkerboard with an ArUco marker in every white square, as OpenCV lays it out.
+
+    Its corners are the inner corners of the checkerboard, numbered as OpenCV does.
+    """
+
+    length_name = "square_m"
+
+    type: Literal["charuco"] = "charuco"
+    squares: tuple[Count, Count]  # in a row, in a column
+    square_m: Length
+    marker_m: Length
+    dictionary: str = "DICT_4X4_50"
+    legacy: bool = False  # the layout of OpenCV before 4.6, which differs for even rows
+    inverted: bool = False  # printed with black and white swapped
+
+    @field_validator("dictionary")
+    @classmethod
+    def _dictionary_exists(cls, name: str) -> str:
+        if name in DICTIONARIES:
+            return name
+        raise ValueError(f"OpenCV has no such dictionary; it has {_closest(name)}")
+
+    @field_validator("marker_m")
+    @classmethod
+    def _marker_fits_its_square(cls, marker_m: float, info: ValidationInfo) -> float:
+        square_m = info.data.get("square_m", np.inf)
+        if marker_m >= square_m:
+            raise ValueError(f"a marker must be smaller than a square of {square_m:g} m")
+        return marker_m
+
+    @field_validator("squares")
+    @classmethod
+    def _has_inner_corners(cls, squares: tuple[int, int]) -> tuple[int, int]:
+        if (squares[0] - 1) * (squares[1] - 1) < 4:
+            raise ValueError("3 squares or more are needed on both sides to have 4 inner corners")
+        return squares
+
+    @property
+    def columns(self) -> int:
+        return self.squares[0] - 1
+
+    @property
+    def rows(self) -> int:
+        return self.squares[1] - 1
+
+    @property
+    def corners_m(self) -> FloatArray:
+        return _grid(self.columns, self.rows) * self.square_m
+
+    @property
+    def described(self) -> str:
+        return (
+            f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares "
+            f"({self.dictionary}{', legacy' * self.legacy}{', inverted' * self.inverted})"
+        )
+
+
+class Aprilgrid(Board):
+    """Kalibr's grid of tag36h11 tags with black squares between their corners.
+
+    Tags are numbered from the bottom left, row by row upwards. The corners are numbered as Kalibr
+    does: from the bottom left corner of tag 0, along whole rows of corners, upwards; so their y is
+    0 and negative here, where y points down.
+    """
+
+    length_name = "tag_m"
+
+    type: Literal["aprilgrid"] = "aprilgrid"
+    tags: tuple[Annotated[int, Field(ge=1, le=MOST)], Annotated[int, Field(ge=1, le=MOST)]]
+    tag_m: Length  # side of the black square
+    spacing: Annotated[float, Field(gt=0, lt=1)]  # gap between two tags, in sides of a tag
+    border_bits: Annotated[int, Field(ge=1, le=4)] = 2  # width of a tag's black frame
+    first_id: Annotated[int, Field(ge=0)] = 0  # of the tag at the bottom left
+    inverted: bool = False  # printed with black and white swapped
+
+    @field_validator("tags")
+    @classmethod
+    def _tags_exist(cls, tags: tuple[int, int]) -> tuple[int, int]:
+        n_tags = tags[0] * tags[1]
+        if not 2 <= n_tags <= TAG36H11_IDS:
+            raise ValueError(f"{n_tags} tags: 2 to {TAG36H11_IDS} are possible with tag36h11")
+        return tags
+
+    @field_validator("first_id")
+    @classmethod
+    def _ids_exist(cls, first_id: int, info: ValidationInfo) -> int:
+        tags = info.data.get("tags", (1, 1))
+        last = first_id + tags[0] * tags[1] - 1
+        if last >= TAG36H11_IDS:
+            raise ValueError(f"the last tag would be {last}; tag36h11 ends at {TAG36H11_IDS - 1}")
+        return first_id
+
+    @property
+    def columns(self) -> int:
+        return 2 * self.tags[0]
+
+    @property
+    def rows(self) -> int:
+        return 2 * self.tags[1]
+
+    @property
+    def corners_m(self) -> FloatArray:
+        place = _grid(self.columns, self.rows)
+        tag, side = np.divmod(place, 2)
+        up = tag * (1 + self.spacing) + side
+        result: FloatArray = up * self.tag_m * np.array([1.0, -1.0, 0.0])
+        return result + 0.0  # no -0
+
+    @property
+    def described(self) -> str:
+        return f"an AprilGrid of {self.tags[0]} x {self.tags[1]} tags"
+
+
+class Circles(Board):
+    """A grid of circles as OpenCV lays it out; its corners are the centres of the circles.
+
+    In an asymmetric one every other row is shifted to the right by half the distance of circles in
+    a row.
+    """
+
+    length_name = "spacing_m"
+
+    type: Literal["circles"] = "circles"
+    circles: tuple[Count, Count]  # in a row, rows
+    spacing_m: Length  # between rows; in an asymmetric grid circles in a row are twice as far apart
+    diameter_m: Length | None = None  # of a circle; needed only to print it
+    asymmetric: bool = True
+    inverted: bool = False  # white circles on black
+
+    @field_validator("diameter_m")
+    @classmethod
+    def _circles_do_not_touch(cls, diameter_m: float | None, info: ValidationInfo) -> float | None:
+        spacing_m = info.data.get("spacing_m", np.inf)
+        # Circles of an asymmetric grid, whose flag comes later, have their neighbours farther off.
+        if diameter_m is not None and diameter_m >= np.sqrt(2) * spacing_m:
+            raise ValueError(f"circles would touch at a spacing of {spacing_m:g} m")
+        return diameter_m
+
+    @property
+    def columns(self) -> int:
+        return self.circles[0]
+
+    @property
+    def rows(self) -> int:
+        return self.circles[1]
+
+    @property
+    def nearest_m(self) -> float:
+        """Distance of neighbouring circles."""
+        return float(self.spacing_m * (np.sqrt(2) if self.asymmetric else 1))
+
+    @property
+    def corners_m(self) -> FloatArray:
+        grid = _grid(self.columns, self.rows)
+        if self.asymmetric:
+            grid[:, 0] = 2 * grid[:, 0] + grid[:, 1] % 2
+        return grid * self.spacing_m
+
+    @property
+    def symmetries(self) -> tuple[IntArray, ...]:
+        numbers = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        half = np.rot90(numbers, 2).ravel()
+        if self.asymmetric:
+            # With an odd number of rows the first and the last are shifted alike, and a half turn
+            # shows it.
+            return () if self.rows % 2 else (half,)
+        if self.columns != self.rows:
+            return (half,)
+        return (np.rot90(numbers, 1).ravel(), half, np.rot90(numbers, 3).ravel())
+
+    @property
+    def described(self) -> str:
+        kind = "asymmetric" if self.asymmetric else "symmetric"
+        return f"an {kind} grid of {self.columns} x {self.rows} circles".replace("an s", "a s")
+
+
+BOARD_TYPES: dict[str, type[Board]] = {
+    "checkerboard": Checkerboard,
+    "charuco": Charuco,
+    "aprilgrid": Aprilgrid,
+    "circles": Circles,
+}
+
+
+def _grid(columns: int, rows: int) -> FloatArray:
+    """Column, row, 0 of every place (n, 3), row by row."""
+    x, y = np.meshgrid(np.arange(columns, dtype=float), np.arange(rows, dtype=float))
+    result: FloatArray = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    return result
+
+
+def _closest(name: str) -> str:
+    parts = name.upper().removeprefix("DICT_").split("_")
+    like = [each for each in DICTIONARIES if parts[0] in each] or list(DICTIONARIES)
+    return ", ".join(like)

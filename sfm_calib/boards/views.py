@@ -9,6 +9,15 @@ from graphs.problem import IntArray
 
 
 @dataclass(frozen=True)
+class Detection:
+    """The corners of the board that are seen in an image."""
+
+    corner: IntArray  # (n,) index into Board.corners_m, rising
+    pixels: FloatArray  # (n, 2)
+    sigma_px: FloatArray  # (n,) of one coordinate, as the image itself shows it
+
+
+@dataclass(frozen=True)
 class BoardView:
     """The corners of the board that were found in one image."""
 
