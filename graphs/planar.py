@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +24,7 @@ from graphs.lenses import IntArray, project_point_many
 # A corner that cannot be projected counts as this far off: less would make hiding corners pay.
 UNSEEN_PX = 1000.0
 DAMPING_START, DAMPING_MOST = 1e-4, 1e8
-CONVERGED = 1e-9  # relative fall of the squared error
+CONVERGED = 1e-7  # relative fall of the squared error
 SAME_ANGLE_RAD = np.radians(1.0)  # between solutions that are one
 
 
@@ -96,12 +97,12 @@ class Corners:
     view: IntArray  # (n,) 0 0 0 1 1 2 ...
     camera: IntArray  # (n_views,)
 
-    @property
+    @cached_property
     def begin(self) -> IntArray:
         """First row of each view (n_views,)."""
         return np.searchsorted(self.view, np.arange(len(self.camera)))
 
-    @property
+    @cached_property
     def counts(self) -> IntArray:
         return np.bincount(self.view, minlength=len(self.camera))
 
@@ -233,6 +234,10 @@ class Scene:
     group: IntArray  # (n_views,) which transform each view has
     cam_from_a: Transforms  # (n_views,)
 
+    @cached_property
+    def lenses(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        return lens_arrays(self.cameras)
+
     @staticmethod
     def of_lone_views(cameras: Sequence[Camera], corners: Corners) -> Scene:
         count = len(corners.camera)
@@ -251,7 +256,7 @@ def residuals(scene: Scene, a_from_b: Transforms) -> tuple[FloatArray, FloatArra
     in_cam = np.ascontiguousarray(in_cam + outer.translation[view])
     pixels, by_point = np.empty((len(view), 2)), np.empty((len(view), 2, 3))
     camera = scene.corners.camera[view]
-    project_point_many(*lens_arrays(scene.cameras), camera, in_cam, pixels, by_point)
+    project_point_many(*scene.lenses, camera, in_cam, pixels, by_point)
     error = pixels - scene.corners.pixels
     unseen = np.isnan(error[:, 0])
     error[unseen] = UNSEEN_PX / np.sqrt(2)
