@@ -34,7 +34,7 @@ class ChiSquare:
 
     chi2: float
     rank: int  # directions that count
-    n_stated: int  # directions with any sigma
+    n_parameters: int  # with sigmas, on the side that states more
     p_value: float  # of a larger chi2, if the sigmas are true
     difference_px: float  # rms over all images and ranges
     expected_px: float  # rms that the covariances let expect
@@ -80,7 +80,7 @@ def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
     return ChiSquare(
         chi2,
         rank,
-        len(sigma),
+        max(len(a.covariance.names), len(b.covariance.names)),
         float(stats.chi2.sf(chi2, rank)),
         float((left @ left / n_pixels) ** 0.5),
         float(((sigma**2).sum() / n_pixels) ** 0.5),
@@ -121,7 +121,7 @@ def _by_calibration(side: Stated, at: Sights, found: Difference | None) -> Float
         scaled = tuple(t.scaled(change.scale) for t in side.estimate.cam_from_rig)
         estimate = replace(side.estimate, cam_from_rig=scaled)
         view = projection(estimate, int(index), change.b_from_a @ at.points[rows])
-        blind = np.isnan(view.pixels).any(-1)
+        blind = np.asarray(np.isnan(view.pixels).any(-1))
         for column, name in enumerate(view.names):
             if name in place:
                 by = change.scale if ".translation_" in name else 1.0
