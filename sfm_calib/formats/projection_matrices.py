@@ -44,7 +44,7 @@ def looks_like_matrices(text: str) -> bool:
 
 
 def _is_plain(rows: dict[str, list[float]]) -> bool:
-    return sum(rows.values(), []) != [] and [len(row) for row in rows.values()] == [3, 3, 3]
+    return [len(row) for row in rows.values()] == [3, 3, 3]
 
 
 def read_matrices(path: Path, text: str) -> Read:

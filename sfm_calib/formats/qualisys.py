@@ -1,10 +1,11 @@
 """Qualisys' .qca.txt: XML with lenses in 1/64 px and cameras placed in millimetres.
 
 A row of `transform` is an axis of the camera in the world, x right, y up, z backwards; x, y, z is
-its centre. Distortion is as OpenCV's k1 k2 p1 p2 k3, not scaled: boards fit so, and neither with other
-signs of k nor with a 64th of it. The file counts pixels of the whole sensor, in
-1/64 px, from an origin that it does not state; it is taken as the centre of the first pixel, as
-Pose2Sim does. Counted from that pixel's corner, cx and cy would be half a pixel less.
+its centre. Distortion is OpenCV's k1 k2 p1 p2 k3, not scaled: the boards of a scan fit so
+(0.42 px), and neither with other signs of k (0.63 px) nor with a 64th of it (0.50 px). The file
+counts pixels of the whole sensor, in 1/64 px, from an origin that it does not state; it is taken as
+the centre of the first pixel, as Pose2Sim does. Counted from that pixel's corner, cx and cy would
+be half a pixel less.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ HALF_A_PIXEL = (
 
 def read_qualisys(path: Path, root: ElementTree.Element) -> Read:
     """Raises CalibrationError where an entry is not whole."""
-    cameras, placed = [], []
+    cameras: list[Camera] = []
+    placed: list[Transform] = []
     for entry in root.iterfind("cameras/camera"):
         name = entry.get("serial", f"cam{len(cameras) + 1}")
         try:
