@@ -1,0 +1,138 @@
+"""Which format a file has, told from what is in it, and its reading."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import yaml
+
+from sfm_calib.errors import CalibrationError
+from sfm_calib.formats.caliscope import cameras_in, read_caliscope
+from sfm_calib.formats.colmap_model import read_colmap
+from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS, read_file_storage
+from sfm_calib.formats.kalibr import read_kalibr
+from sfm_calib.formats.ours import read_ours
+from sfm_calib.formats.projection_matrices import looks_like_matrices, read_matrices
+from sfm_calib.formats.qualisys import read_qualisys
+from sfm_calib.formats.reading import Read
+from sfm_calib.formats.ros import read_ros, read_ros_pair
+
+KNOWN = (
+    "sfm_calib's calibration.json, OpenCV FileStorage (YAML, XML, JSON), ROS camera_info, "
+    "a COLMAP model's folder, Kalibr's camchain, Caliscope's camera_array.toml, Qualisys' "
+    ".qca.txt, KITTI's calib.txt"
+)
+MOST_BYTES = 50_000_000  # of a calibration; beyond, it is something else
+COLMAP_FILES = ("cameras.txt", "cameras.bin")
+YAML_SUFFIXES = (".yaml", ".yml")
+
+
+def read_calibration(path: Path) -> Read:
+    """Read a calibration of any known format, from a file or a folder.
+
+    Raises CalibrationError in one line: what is wrong, or which formats are known.
+    """
+    if path.is_dir():
+        return _folder(path)
+    if path.name in COLMAP_FILES:
+        return read_colmap(path.parent)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise CalibrationError(_unknown(path))
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise CalibrationError(_unknown(path)) from error
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
+    return _text(path, text)
+
+
+def _unknown(path: Path) -> str:
+    return f"{path} is no calibration that can be read: known are {KNOWN}"
+
+
+def _folder(folder: Path) -> Read:
+    if any((folder / name).is_file() for name in COLMAP_FILES):
+        return read_colmap(folder)
+    if (folder / "calibration.json").is_file():
+        return read_ours(folder / "calibration.json")
+    found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
+    for path in found:
+        if path.stem in (INTRINSICS, EXTRINSICS):
+            return read_calibration(path)
+    contents = [_yaml(path.read_text("utf-8", "replace")) for path in found]
+    if found and all(_is_ros(content) for content in contents):
+        return read_ros_pair(tuple(found), tuple(c for c in contents if c is not None))
+    raise CalibrationError(
+        f"{folder} holds no calibration: a folder is read as a COLMAP model (cameras.txt or .bin), "
+        "or for its calibration.json, intrinsics.yml or ROS camera_info files"
+    )
+
+
+def _text(path: Path, text: str) -> Read:
+    start = text.lstrip("\ufeff \t\r\n")
+    if start.startswith("<"):
+        return _xml(path, start)
+    if start.startswith("{"):
+        return _json(path, start)
+    if start.startswith("%YAML:"):  # OpenCV's alone: YAML itself writes "%YAML 1.2"
+        return read_file_storage(path)
+    if looks_like_matrices(text):
+        return read_matrices(path, text)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        content = {}
+    if cameras_in(content):
+        return read_caliscope(path, content)
+    return _of_yaml(path, _yaml(text))
+
+
+def _xml(path: Path, text: str) -> Read:
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise CalibrationError(f"{path} is no whole XML: {error}") from error
+    if root.tag == "opencv_storage":
+        return read_file_storage(path)
+    if root.find("cameras/camera/intrinsic") is not None:
+        return read_qualisys(path, root)
+    raise CalibrationError(_unknown(path))
+
+
+def _json(path: Path, text: str) -> Read:
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise CalibrationError(f"{path} is no whole JSON: {error}") from error
+    if "cameras" in content or str(content.get("format", "")).startswith("sfm_calib"):
+        return read_ours(path)
+    return read_file_storage(path)
+
+
+def _yaml(text: str) -> Mapping[str, Any] | None:
+    """None where it is no YAML mapping."""
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
+    return content if isinstance(content, Mapping) else None
+
+
+def _is_ros(content: Mapping[str, Any] | None) -> bool:
+    return content is not None and {"camera_matrix", "image_width", "image_height"} <= set(content)
+
+
+def _of_yaml(path: Path, content: Mapping[str, Any] | None) -> Read:
+    if content is None:
+        raise CalibrationError(_unknown(path))
+    if _is_ros(content):
+        return read_ros(path, content)
+    if any(isinstance(e, Mapping) and "camera_model" in e for e in content.values()):
+        return read_kalibr(path, content)
+    raise CalibrationError(_unknown(path))

@@ -1,0 +1,30 @@
+"""Our own calibration.json and truth.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from graphs.covariance import Covariance
+from graphs.propagation import marginal
+from sfm_calib.formats.reading import NOTHING, LengthUnit, Read
+from sfm_calib.result import load_calibration
+from sfm_calib.uncertainty import unit_of
+
+
+def read_ours(path: Path) -> Read:
+    """A calibration.json with its joint covariance; a truth.json has none."""
+    calibration = load_calibration(path)
+    names = tuple(calibration.cameras)
+    stated = Covariance(calibration.covariance.names, np.array(calibration.covariance.matrix))
+    known = [name for name in stated.names if name.rpartition(".")[0] in names]
+    unit: LengthUnit = unit_of(calibration) or "unknown"
+    return Read(
+        path,
+        f"{calibration.format}",
+        tuple(calibration.camera(name) for name in names),
+        tuple(calibration.cam_from_rig(name) for name in names),
+        unit,
+        marginal(stated, known) if known else NOTHING,
+    )
