@@ -120,11 +120,14 @@ class Options:
     """Where features, matches and models are kept."""
 
 
-def main(options: Options) -> None:
-    """Print a table a case."""
+def main(options: Options) -> list[Calibration]:
+    """Print a table a case; returns their results."""
     console = Console(width=None if sys.stdout.isatty() else 130, markup=False, highlight=False)
+    found = []
     for case, calibration in ledgers(options.folder, Cache(options.out / "cache")):
         show(case, calibration, console)
+        found.append(calibration)
+    return found
 
 
 if __name__ == "__main__":

@@ -227,7 +227,7 @@ def judged(rows: Sequence[SourceRow], lengths: Lengths) -> ScaleLedger:
             sigma_m = math.sqrt(max(variance, 0.0) * one.whole**2 + one.spread**2)
             entry = LedgerEntry(
                 one.name, one.measured, one.sigma, one.estimated,
-                one.measured + apart * one.whole, sigma_m,
+                one.measured + float(apart) * one.whole, sigma_m,
             )  # fmt: skip
         entries.append(entry)
     ledger = ScaleLedger(tuple(entries))

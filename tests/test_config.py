@@ -220,6 +220,17 @@ UNKNOWN = {
         {"scale": {"frames": {"between": ["1", "1"], "length_m": 1, "sigma_m": 1}}},
         "a distance from 1 to itself; name two frames",
     ),
+    "frame of the second of two paths": (
+        {
+            "scale": {
+                "frames": [
+                    {"between": ["0", "1"], "length_m": 1, "sigma_m": 1},
+                    {"between": ["0", "7"], "length_m": 1, "sigma_m": 1},
+                ]
+            }
+        },
+        "scale.frames.1.between: the scan has no frame '7'; it has 0, 1, 2",
+    ),
 }
 
 

@@ -13,13 +13,14 @@ from graphs.frames import FloatArray, Transform, exp_rotation
 from graphs.jackknife import (
     BLOCKS,
     Jackknife,
+    _of_scale,
     blocks_of,
     change,
     delete_group_jackknife,
     solve_part,
 )
 from graphs.model_covariance import ModelCovariance, model_covariance
-from graphs.problem import Estimate, KnownPath, Problem
+from graphs.problem import Estimate, KnownPath, KnownSpan, Problem
 from graphs.selection import select_tracks
 from graphs.solve import solve
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
@@ -163,6 +164,20 @@ def test_the_ends_of_a_measured_path_stay() -> None:
     assert found.failed == ()
     place = found.names.index("cam1.translation_x")
     assert np.isfinite(found.moved).all() and np.abs(found.moved[:, place]).max() < 0.05
+
+
+def test_frames_of_every_measured_length_are_kept() -> None:
+    problem = problem_of()
+    rows = np.flatnonzero(np.isin(problem.observations.point, (5, 9)))
+    clicked = set(problem.observations.frame[rows].tolist())
+    scales = (
+        KnownPath((3, 15), 1.0, 0.1),
+        KnownSpan((5, 9), 1.0, 0.1),
+        KnownPath((7, 3), 1.0, 0.1),
+    )
+    kept = _of_scale(replace(problem, scales=scales))
+    assert set(kept.tolist()) == clicked | {3, 7, 15}
+    assert _of_scale(problem).size == 0
 
 
 def test_shared_lenses_move_as_one() -> None:

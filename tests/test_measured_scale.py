@@ -125,6 +125,51 @@ def test_a_measured_distance_makes_the_result_metric(
         assert result.rig.scale.sigma_relative == pytest.approx(0.003, rel=0.02)
 
 
+def all_of(true: Estimate, problem: Problem) -> dict[str, object]:
+    """A `scale` with a source of every kind, of paths two."""
+    rng = np.random.default_rng(5)
+    said: dict[str, object] = {}
+    for kind in WORDS:
+        said |= said_of(kind, true, problem, rng)
+    ends = [true.rig_from_world[f].inverse.translation for f in (2, 9)]
+    length_m = float(np.linalg.norm(ends[1] - ends[0]))
+    names = [problem.frame_names[f] for f in (2, 9)]
+    second = {"between": names, "length_m": length_m, "sigma_m": 0.003 * length_m}
+    return said | {"frames": [said["frames"], second]}
+
+
+def test_measured_distances_of_every_kind_test_each_other(
+    mapped: tuple[Problem, Estimate],
+) -> None:
+    problem, true = mapped
+    scale = all_of(true, problem)
+    result = calibrated(problem, scale)
+    ledger = result.rig.scale.ledger
+    words = ["baseline cam0 to cam1", "distance from frame 000000 to frame 000006"]
+    words += ["distance from frame 000002 to frame 000009", "distance between two clicked marks"]
+    assert [entry.what for entry in ledger] == words
+    assert all(entry.z is not None and abs(entry.z) < 3 for entry in ledger)
+    assert not result.rig.scale.contradicted and result.rig.scale.source.endswith(", and 3 more")
+    alone = min(entry.sigma_m / entry.measured_m for entry in ledger)
+    assert 0.4 * alone < (result.rig.scale.sigma_relative or 0.0) < 0.7 * alone
+    scale["baseline"]["length_m"] *= 1.05
+    wrong = calibrated(problem, scale)
+    assert wrong.rig.scale.contradicted and wrong.verdict is not None and wrong.verdict.usable
+    assert [entry.suspect for entry in wrong.rig.scale.ledger] == [True, False, False, False]
+    (told,) = [message for message in wrong.verdict.messages if "contradicts" in message]
+    assert told == wrong.verdict.messages[0] and told.startswith("the baseline cam0 to cam1 of ")
+
+
+def test_the_best_distance_gives_the_size_to_start_from(mapped: tuple[Problem, Estimate]) -> None:
+    problem, true = mapped
+    scale = all_of(true, problem)
+    scale["frames"][1]["sigma_m"] /= 10
+    started = start_of(problem, scale)
+    assert len(started.scales) == 4
+    best = started.scales[2]
+    assert length_of(best, started.initial) == pytest.approx(best.length_m)
+
+
 # ---- clicks become tracks -------------------------------------------------------------------
 
 Scale = dict[str, dict[str, object]]
@@ -301,6 +346,16 @@ def test_clicks_that_the_scan_does_not_have(second: list[dict[str, object]], mes
     with pytest.raises(CalibrationError) as caught:
         checked({"points": {"between": [CLICKS, second], **said}})
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_click_counts_for_one_distance() -> None:
+    said = {"between": [CLICKS, OTHERS], "length_m": 1.0, "sigma_m": 0.1}
+    moved = [click | {"pixel": [5.0 + i, 90.0]} for i, click in enumerate(OTHERS)]
+    more = [click | {"pixel": [5.0 + i, 99.0]} for i, click in enumerate(OTHERS)]
+    checked({"points": [said, said | {"between": [moved, more]}]})
+    message = r"scale.points.1.between: the click \(0, 50\) in a/1 is one of scale.points.0 already"
+    with pytest.raises(CalibrationError, match=message):
+        checked({"points": [said, said | {"between": [moved, OTHERS]}]})
 
 
 def test_clicks_may_lie_on_the_outermost_pixels() -> None:

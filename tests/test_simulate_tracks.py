@@ -117,6 +117,17 @@ def test_tracks_survive_the_file(rig: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(calibration.camera("cam0").params, true.cameras[0].params)
 
 
+def test_tracks_of_old_hold_one_flat_baseline(tmp_path: Path) -> None:
+    problem, true = simulate_tracks(TRACKS, rng())
+    write_tracks(problem, true, tmp_path)
+    with np.load(tmp_path / "tracks.npz") as arrays:
+        old = {name: arrays[name] for name in arrays.files}
+    for name in ("scale", "scale_cameras"):
+        (old[name],) = old[name]
+    np.savez_compressed(tmp_path / "tracks.npz", **old)
+    assert read_tracks(tmp_path)[0].scales == problem.scales != ()
+
+
 def test_scales_survive_the_file(tmp_path: Path) -> None:
     problem, true = simulate_tracks(TRACKS.model_copy(update={"noise_by_scale": True}), rng())
     scale = problem.observations.feature_scale

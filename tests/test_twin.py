@@ -9,8 +9,9 @@ import pytest
 
 from graphs.build import GraphOptions
 from graphs.priors import PINNED_SIGMA, LensPrior
-from graphs.problem import KnownBaseline, residuals_px
+from graphs.problem import KnownBaseline, KnownPath, residuals_px
 from graphs.refine import Refinement, refine
+from graphs.scale import length_of
 from graphs.twin import Certificate, certify, twin_problem, worst
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
@@ -65,6 +66,23 @@ def test_a_measured_distance_errs_anew(refinement: Refinement) -> None:
     true = np.linalg.norm(refinement.estimate.cam_from_rig[1].translation)
     assert np.std(lengths) == pytest.approx(TRACKS.baseline_sigma_m, rel=0.4)
     assert np.mean(lengths) == pytest.approx(true, abs=3e-4)
+
+
+def test_every_measured_distance_errs_for_itself(refinement: Refinement) -> None:
+    problem = refinement.problem
+    scales = (*problem.scales, KnownPath((0, 5), 99.0, 0.01))
+    known = replace(
+        refinement, graph=replace(refinement.graph, problem=replace(problem, scales=scales))
+    )
+    drawn = [twin_problem(known, np.random.default_rng(seed)).scales for seed in range(60)]
+    off = np.array(
+        [
+            [(s.length_m - length_of(s, refinement.estimate)) / s.sigma_m for s in own]
+            for own in drawn
+        ]
+    )
+    assert np.abs(off.std(axis=0) - 1).max() < 0.3
+    assert abs(np.corrcoef(off.T)[0, 1]) < 0.4
 
 
 def test_a_good_scan_is_certified_and_the_same_every_time(refinement: Refinement) -> None:
