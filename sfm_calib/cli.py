@@ -1,4 +1,4 @@
-"""The command line: `sfm-calib calibrate`, `check`, `simulate`, `simulate-tracks`, `demo`."""
+"""The command line of `sfm-calib`: which command was given, and what it does."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,24 +18,34 @@ import tyro
 from pydantic import ValidationError
 
 import sfm_calib
+from sfm_calib.boards.load import load_board
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, calibrate
 from sfm_calib.check import check_scan
 from sfm_calib.check_terminal import print_check
 from sfm_calib.colmap import quiet
+from sfm_calib.commands import (
+    Calibrate,
+    Check,
+    Command,
+    Demo,
+    Simulate,
+    SimulateTracks,
+    Target,
+)
+from sfm_calib.compare_command import Compare, run_compare
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
-from sfm_calib.config import RIG_FILE, Options, RigConfig, first_problem, load_rig_config
+from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.images import camera_names, check_exists
 from sfm_calib.report import TruthRow, write_report
 from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
-from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks, write_tracks
+from sfm_calib.simulate.tracks import simulate_tracks, write_tracks
+from sfm_calib.target import calibrate_target
 from sfm_calib.terminal import print_comparison, print_result, progress_bars, result_console
 
-Out = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="OUT")]
-Verbose = Annotated[bool, tyro.conf.arg(aliases=("-v",))]
 LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 EXIT_BAD_INPUT = 2
 DEMO_FRAMES = 24
@@ -44,96 +53,17 @@ DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the
 EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
 
 
-@dataclass(frozen=True)
-class Calibrate:
-    """Calibrate the cameras of a scan, and the rig they sit on.
-
-    Writes OUT/calibration.json and OUT/report.html; OUT/cache holds features, matches and the
-    reconstruction for the next run.
-    """
-
-    scan: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
-    """Folder with a sub-folder of images per camera, or of one camera's images, or a video."""
-    out: Out
-    """Folder for the results."""
-    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
-    truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A truth.json to compare with, as `simulate` writes it."""
-    fresh: bool = False
-    """Ignore what earlier runs left in OUT/cache."""
-    json: bool = False
-    """Print calibration.json on stdout instead of the table."""
-    verbose: Verbose = False
-    """Show COLMAP's own log."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """Say whether a scan can calibrate its rig, and what to add, before the full solve.
-
-    Takes as long as features, matches and mapping do. With -o, OUT/cache keeps these for
-    `calibrate -o OUT`, and OUT/check.json the numbers. The exit code is 0 whatever is found.
-    """
-
-    scan: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
-    """Folder with a sub-folder of images per camera, or of one camera's images, or a video."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="OUT")] = None
-    """Folder for cache and check.json; default: nothing is kept."""
-    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
-    fresh: bool = False
-    """Ignore what earlier runs left in OUT/cache."""
-    json: bool = False
-    """Print check.json on stdout instead of the table."""
-    verbose: Verbose = False
-    """Show COLMAP's own log."""
-
-
-@dataclass(frozen=True)
-class Simulate:
-    """Render a scan of a textured room with known truth: OUT/scan and OUT/truth.json."""
-
-    out: Out
-    """Folder for the scan and its truth."""
-    options: Annotated[SimulateOptions, tyro.conf.arg(name="")] = field(
-        default_factory=SimulateOptions
-    )
-    overwrite: bool = False
-    """Replace an earlier simulation in OUT."""
-
-
-@dataclass(frozen=True)
-class SimulateTracks:
-    """Simulate feature tracks with known truth: OUT/tracks.npz and OUT/truth.json."""
-
-    out: Out
-    """Folder for the tracks and their truth."""
-    options: Annotated[TrackOptions, tyro.conf.arg(name="")] = field(default_factory=TrackOptions)
-    seed: int = 0
-    """Seed of points, trajectory, noise and outliers."""
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Simulate a three-camera scan, calibrate it, and hold the result against the truth."""
-
-    out: Out = Path("out/demo")
-    """Folder for scan, truth.json, calibration.json and report.html."""
-    seed: int = 0
-    """Seed of the room, the trajectory, the noise and the solver."""
-    verbose: Verbose = False
-    """Show COLMAP's own log."""
-
-
-Command = Calibrate | Check | Simulate | SimulateTracks | Demo
-
-
-def parse(argv: Sequence[str], options: Options | None = None) -> Command:
-    """The command line as a command; `options` are the defaults that a rig.yaml gives."""
-    default = Calibrate(tyro.MISSING, tyro.MISSING, options or Options())
+def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
+    """The command line as a command; a rig.yaml's `config` gives the defaults."""
+    config = config or RigConfig()
+    default = Calibrate(tyro.MISSING, tyro.MISSING, config.options())
     calibrate_type = Annotated[Calibrate, tyro.conf.subcommand("calibrate", default=default)]
-    check_default = Check(tyro.MISSING, None, options or Options())
+    target_default = Target(tyro.MISSING, tyro.MISSING, tyro.MISSING, config.target_options())
+    check_default = Check(tyro.MISSING, None, config.options())
     commands: Any = (
         calibrate_type
+        | Annotated[Target, tyro.conf.subcommand("target", default=target_default)]
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
@@ -191,6 +121,11 @@ def run(command: Command, arguments: Sequence[str]) -> None:
     """Do what a parsed command asks for."""
     if isinstance(command, Calibrate):
         run_calibrate(command, arguments)
+    elif isinstance(command, Target):
+        run_target(command, arguments)
+    elif isinstance(command, Compare):
+        with output_folder(command.out) if command.out else nullcontext():
+            run_compare(command)
     elif isinstance(command, Check):
         run_check(command, arguments)
     elif isinstance(command, Simulate):
@@ -217,6 +152,29 @@ def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
         )
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
         finish(outcome, command.out, rows, command.json)
+
+
+def run_target(command: Target, arguments: Sequence[str]) -> None:
+    """Calibrate from a board, and compare with the truth where it is given."""
+    board = load_board(command.board)
+    from_file = load_rig_config(rig_file(command.images))
+    again = parse(arguments, from_file)
+    assert isinstance(again, Target)
+    config = from_file.with_options(again.options)
+    truth = load_calibration(command.truth) if command.truth else None
+    with output_folder(command.out):
+        with progress_bars() as progress:
+            cache = Cache(command.out / "cache", command.fresh)
+            outcome = calibrate_target(
+                command.images, board, again.options, config, cache, progress, told(arguments)
+            )
+        rows = compare_with_truth(outcome.calibration, truth) if truth else []
+        finish(outcome, command.out, rows, command.json)
+
+
+def told(arguments: Sequence[str]) -> str:
+    """The command line, for the result to tell."""
+    return shlex.join(["sfm-calib", *arguments]).encode(errors="backslashreplace").decode()
 
 
 def run_check(command: Check, arguments: Sequence[str]) -> None:
@@ -254,7 +212,7 @@ def config_of(scan: Path, arguments: Sequence[str]) -> RigConfig:
     """What is asked of a scan: flags go before rig.yaml, and rig.yaml before the defaults."""
     check_exists(scan)
     from_file = load_rig_config(rig_file(scan))
-    again = parse(arguments, from_file.options())
+    again = parse(arguments, from_file)
     assert isinstance(again, Calibrate | Check)
     return from_file.with_options(again.options)
 
@@ -274,9 +232,8 @@ def calibrate_into(
 ) -> Outcome:
     """Calibrate with the cache in OUT/cache, under progress bars."""
     quiet(verbose)
-    command = shlex.join(["sfm-calib", *arguments]).encode(errors="backslashreplace").decode()
     with progress_bars() as progress:
-        return calibrate(scan, config, Cache(out / "cache", fresh), progress, command)
+        return calibrate(scan, config, Cache(out / "cache", fresh), progress, told(arguments))
 
 
 @contextmanager

@@ -31,8 +31,8 @@ FEWEST_TWINS = 10  # the mean of fewer is known to a third and less
 QUATERNION_TOLERANCE = 0.01  # typed by hand to two digits
 
 
-class Options(BaseModel):
-    """How a scan is read, mapped and solved."""
+class SolveOptions(BaseModel):
+    """How any problem is solved, of a scan or of a board."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -40,20 +40,10 @@ class Options(BaseModel):
     """Lens of every camera that rig.yaml gives none; auto: what predicts frames held out best."""
     reference: Annotated[str | None, tyro.conf.arg(metavar="CAMERA")] = None
     """Camera whose frame is the rig's frame; default: the first by name."""
-    frames: Literal["stem", "order"] = "stem"
-    """Which images make one frame: the same file stem, or the same place in sorted order."""
-    pairs: Literal["auto", "all", "selected"] = "auto"
-    """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
-    max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
-    """SIFT features an image, at most: 100 to 50000."""
     video_frames: Annotated[int, Field(ge=3, le=2000)] = 80
     """Frames picked from a video, at most: 3 to 2000."""
     loss: LossChoice = "cauchy"
-    """Robust loss on feature observations; adaptive: its shape estimated from the residuals."""
-    min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
-    """Points seen under a smaller angle are left out: they say little and harm the solve."""
-    max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS
-    """Observations in the graph, at most: the tracks that say most, spread over the images."""
+    """Robust loss on observations; adaptive: its shape estimated from the residuals."""
     principal_point_sigma: Annotated[float, Field(gt=0, le=10)] = 0.03
     """Belief that the principal point is near the image centre: sigma in image widths."""
     aspect_sigma: Annotated[float, Field(gt=0, le=10)] = 0.005
@@ -70,6 +60,31 @@ class Options(BaseModel):
         if 0 < trials < FEWEST_TWINS:
             raise ValueError(f"{trials} twins show too little: give {FEWEST_TWINS} or more, or 0")
         return trials
+
+
+class Options(SolveOptions):
+    """How a scan is read, mapped and solved."""
+
+    frames: Literal["stem", "order"] = "stem"
+    """Which images make one frame: the same file stem, or the same place in sorted order."""
+    pairs: Literal["auto", "all", "selected"] = "auto"
+    """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
+    max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
+    """SIFT features an image, at most: 100 to 50000."""
+    min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
+    """Points seen under a smaller angle are left out: they say little and harm the solve."""
+    max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS
+    """Observations in the graph, at most: the tracks that say most, spread over the images."""
+
+
+class TargetOptions(SolveOptions):
+    """How images of a board are read and solved."""
+
+    frames: Literal["stem", "order", "time"] = "stem"
+    """Which images make one frame: the same file stem, the same place in sorted order, or the
+    nearest time, where stems are times."""
+    tolerance_s: Annotated[float, tyro.conf.arg(metavar="S"), Field(gt=0)] | None = None
+    """Times this far apart, in seconds, may be one frame; default: a third of their spacing."""
 
 
 class CameraConfig(BaseModel):
@@ -214,8 +229,17 @@ class RigConfig(Options):
         """The options alone, without what is known of the rig."""
         return Options(**{name: getattr(self, name) for name in Options.model_fields})
 
-    def with_options(self, options: Options) -> RigConfig:
-        return self.model_copy(update=dict(options))
+    def with_options(self, options: SolveOptions) -> RigConfig:
+        """With these options in place of its own, as far as it has them."""
+        own = {name: value for name, value in options if name in RigConfig.model_fields}
+        if own.get("frames") == "time":  # of a board's images alone
+            del own["frames"]
+        return self.model_copy(update=own)
+
+    def target_options(self) -> TargetOptions:
+        """What it says on how to solve, as options of a target-based calibration."""
+        known = set(TargetOptions.model_fields) & set(RigConfig.model_fields)
+        return TargetOptions(**{name: getattr(self, name) for name in known})
 
 
 def load_rig_config(path: Path) -> RigConfig:

@@ -6,13 +6,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from graphs.board_start import BoardScene, BoardStart, start_from_board
-from graphs.board_thin import redundant, thin
 
 from graphs.board_problem import SeenCorners, board_problem
+from graphs.board_start import BoardScene, BoardStart, start_from_board
+from graphs.board_thin import redundant, thin
 from graphs.camera import fit_lens
 from graphs.problem import Board, IntArray, Problem
 from sfm_calib.board_use import BoardUse
@@ -20,13 +19,14 @@ from sfm_calib.boards import spec
 from sfm_calib.boards.find import find_board
 from sfm_calib.boards.views import BoardView, BoardViews
 from sfm_calib.cache import Cache
-from sfm_calib.calibrate import Given, Outcome, Stopwatch, determine, refusals
-from sfm_calib.config import RigConfig
+from sfm_calib.calibrate import Outcome, Stopwatch, determine, refusals
+from sfm_calib.config import RigConfig, TargetOptions
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping import Mapped, reference_of, some
 from sfm_calib.nominal import check_config, known_cameras, lens_of, on_ladder, start_from_config
+from sfm_calib.run import Given
 from sfm_calib.target_images import read_target
 
 # Of the board's longer side, how far its middle may stand out: paper on cardboard bows by a few
@@ -34,13 +34,11 @@ from sfm_calib.target_images import read_target
 BEND_SIGMA = 0.005
 MIN_VIEWS = 3  # of a camera: each gives two numbers on its lens beyond the board's place
 
-Matching = Literal["stem", "order", "time"]
-
 
 def calibrate_target(
     images: Path,
     board: spec.Board,
-    matching: Matching,
+    options: TargetOptions,
     config: RigConfig,
     cache: Cache,
     progress: Progress,
@@ -53,7 +51,9 @@ def calibrate_target(
     """
     watch = Stopwatch()
     with watch.stage("reading images"):
-        scan = read_target(images, cache, matching, config.video_frames, None, progress)
+        scan = read_target(
+            images, cache, options.frames, options.video_frames, options.tolerance_s, progress
+        )
         check_config(config, scan)
     with watch.stage("finding the board"):
         found = find_board(scan, board, progress)
