@@ -79,7 +79,7 @@ def beside(scan: Problem, boards: Problem) -> Problem:
     Both have the same cameras, in one order, and the same unit of length: lenses and rig start as
     the scan has them.
     """
-    assert boards.board is not None and scan.board is None
+    assert boards.board is not None
     a, b = scan.initial, boards.initial
     n_points, n_frames = len(a.points), len(scan.frame_names)
     other = boards.observations
@@ -94,7 +94,7 @@ def beside(scan: Problem, boards: Problem) -> Problem:
         ),
         observations=joined([scan.observations, moved]),
         frame_names=(*scan.frame_names, *boards.frame_names),
-        board=_behind(n_points, boards.board),
+        board=_behind(n_points, boards.board, scan.board),
     )
 
 
@@ -123,10 +123,12 @@ def standing_in(
     )
 
 
-def _behind(n_points: int, board: BoardPoints) -> BoardPoints:
-    """The board's points after so many of the scene."""
+def _behind(n_points: int, board: BoardPoints, before: BoardPoints | None = None) -> BoardPoints:
+    """The board's points after so many others, of the scene or of the same board."""
+    corner = np.full(n_points, -1) if before is None else before.corner
+    still = np.zeros(n_points, dtype=bool) if before is None else before.still
     return replace(
         board,
-        corner=np.concatenate([np.full(n_points, -1), board.corner]),
-        still=np.concatenate([np.zeros(n_points, dtype=bool), board.still]),
+        corner=np.concatenate([corner, board.corner]),
+        still=np.concatenate([still, board.still]),
     )

@@ -73,15 +73,28 @@ def calibrate(
     Raises CalibrationError with cause, number and remedy when the scan does not allow it.
     """
     watch = Stopwatch()
+    given, problem = mapped_scan(scan_path, config, cache, progress, command, watch)
+    with enough_placed(problem, len(given.scan.images)):
+        return determine(given, problem, watch, progress)
+
+
+def mapped_scan(
+    scan_path: Path,
+    config: RigConfig,
+    cache: Cache,
+    progress: Progress,
+    command: str,
+    watch: Stopwatch,
+) -> tuple[Given, Problem]:
+    """A scan's problem, started as rig.yaml has it, and what it came from."""
     with watch.stage("reading images"):
         scan = read_scan(scan_path, cache, config.frames, config.video_frames, progress)
         check_config(config, scan)
     lenses = [lens_of(config, name, len(scan.cameras)) for name in scan.cameras]
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
-    problem = start_from_config(mapped.problem, config)
-    with enough_placed(problem, len(scan.images)):
-        return determine(Given(scan, config, mapped, command), problem, watch, progress)
+    given = Given(scan, config, mapped, command)
+    return given, start_from_config(mapped.problem, config)
 
 
 def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progress) -> Outcome:

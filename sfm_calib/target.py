@@ -13,11 +13,12 @@ from graphs.board_problem import SeenCorners, board_problem
 from graphs.board_start import BoardScene, BoardStart, start_from_board
 from graphs.board_thin import redundant, thin
 from graphs.camera import fit_lens
+from graphs.planar import SeenBoard
 from graphs.problem import Board, IntArray, Problem
 from sfm_calib.board_use import BoardUse
 from sfm_calib.boards import spec
 from sfm_calib.boards.find import find_board
-from sfm_calib.boards.views import BoardView, BoardViews
+from sfm_calib.boards.views import BoardViews
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, Stopwatch, determine, refusals
 from sfm_calib.config import RigConfig, TargetOptions
@@ -61,7 +62,11 @@ def calibrate_target(
         views = diverse(found.views, board, config.video_frames)
         started = start(views, board, config, scan)
         problem = with_lenses(problem_of(started, views, board, reference_of(scan, config)), config)
-    use = BoardUse(board, left_out(started, views), repeated(started, views, board))
+    use = BoardUse(
+        board,
+        left_out(started, views.views, views),
+        repeated(started, views.views, views, board),
+    )
     messages = (*found.messages, *started.notes, *use.messages)
     hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
     mapped = Mapped(problem, messages, hashes)
@@ -144,7 +149,7 @@ def with_lenses(problem: Problem, config: RigConfig) -> Problem:
 
 
 def seen_corners(
-    views: Sequence[BoardView], corners: Sequence[IntArray], place: dict[int, int]
+    views: Sequence[SeenBoard], corners: Sequence[IntArray], place: dict[int, int]
 ) -> SeenCorners:
     """All corners of some views, renumbered; `place`: of each frame among the problem's."""
     lengths = [len(view.pixels) for view in views]
@@ -157,17 +162,19 @@ def seen_corners(
     )
 
 
-def left_out(started: BoardStart, views: BoardViews) -> tuple[str, ...]:
-    """Views of the board that were not used, and why."""
+def left_out(started: BoardStart, given: Sequence[SeenBoard], names: BoardViews) -> tuple[str, ...]:
+    """Views of the board that were not used, and why; `given`: those that the start was given."""
     return tuple(
-        f"{views.cameras[views.views[one.view].camera]}/"
-        f"{views.frames[views.views[one.view].frame]}: {one.reason}"
+        f"{names.cameras[given[one.view].camera]}/{names.frames[given[one.view].frame]}: "
+        f"{one.reason}"
         for one in started.dropped
     )
 
 
-def repeated(started: BoardStart, views: BoardViews, board: spec.Board) -> tuple[str, ...]:
+def repeated(
+    started: BoardStart, given: Sequence[SeenBoard], names: BoardViews, board: spec.Board
+) -> tuple[str, ...]:
     """Groups of frames in which the board lies alike, in words."""
-    kept = [views.views[index] for index in started.kept]
-    groups = redundant(kept, len(board.corners_m), views.sizes)
-    return tuple(some([views.frames[frame] for frame in group]) for group in groups)
+    kept = [given[index] for index in started.kept]
+    groups = redundant(kept, len(board.corners_m), names.sizes)
+    return tuple(some([names.frames[frame] for frame in group]) for group in groups)
