@@ -13,7 +13,7 @@ from graphs.board_join import PlacedFrame, place_boards, still_board
 from graphs.board_problem import SeenCorners, beside, board_problem, standing_in
 from graphs.problem import Problem
 from graphs.refine import Refinement
-from sfm_calib.board_use import BoardUse, Without
+from sfm_calib.board_use import BoardUse
 from sfm_calib.boards import spec
 from sfm_calib.boards.find import find_board
 from sfm_calib.boards.views import BoardViews
@@ -21,8 +21,6 @@ from sfm_calib.cache import Cache
 from sfm_calib.calibrate import (
     Outcome,
     Stopwatch,
-    choose_lens,
-    covariance_of,
     determine,
     enough_placed,
     mapped_scan,
@@ -56,16 +54,13 @@ def calibrate_with_board(
     with watch.stage("finding the board"):
         views = views_of_board(given.scan, board, board_images, config, cache, progress)
     with enough_placed(problem, len(given.scan.images)):
-        with watch.stage("the scan alone"):
-            ladder = choose_lens(problem, config, progress)
-            alone = solve_problem(problem, config, progress, ladder)
-            covariance, _ = covariance_of(alone, config, progress)
-        with watch.stage("placing the board"), refusals():
-            joined, use = anchored(alone, board, views)
-        use = replace(use, without=Without(alone.estimate, covariance))
+        with watch.stage("placing the board"):
+            alone = solve_problem(problem, config, progress)
+            with refusals():
+                joined, use = anchored(alone, board, views)
         messages = (*given.mapped.messages, *views.messages, *use.messages)
         mapped = replace(given.mapped, messages=messages)
-        given = replace(given, mapped=mapped, board=use)
+        given = replace(given, mapped=mapped, board=use, scan_alone=problem)
         return determine(given, joined, watch, progress)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphs.build import GraphOptions
@@ -18,6 +18,7 @@ from graphs.selection import NoParallaxError
 from graphs.split_check import SplitCheck, split_check
 from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
 from graphs.twin import Certificate, certify
+from sfm_calib.board_use import Without
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
@@ -111,12 +112,25 @@ def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progre
         covariance, split = covariance_of(refinement, config, progress)
     with watch.stage("certificate"):
         certificate = certificate_of(refinement, config, progress)
+    board = given.board
+    if board is not None and given.scan_alone is not None:
+        with watch.stage("without the board"):
+            board = replace(board, without=without_board(given.scan_alone, config, ladder))
     run = Run(
         given.scan, config, given.mapped, refinement, covariance, watch.seconds, given.command,
-        ladder, split, certificate, given.board,
+        ladder, split, certificate, board,
     )  # fmt: skip
     calibration, unit = summarise(run)
     return Outcome(calibration, refinement, unit)
+
+
+def without_board(scan: Problem, config: RigConfig, ladder: Ladder | None) -> Without | None:
+    """What the scan alone says, through the lens that was chosen with the board; None: nothing."""
+    try:
+        alone = solve_problem(scan, config, lambda *_: None, ladder)
+        return Without(alone.estimate, covariance_of(alone, config, lambda *_: None)[0])
+    except CalibrationError:
+        return None
 
 
 def options_of(problem: Problem, config: RigConfig) -> GraphOptions:

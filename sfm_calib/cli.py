@@ -18,7 +18,9 @@ import tyro
 from pydantic import ValidationError
 
 import sfm_calib
+from sfm_calib.anchors import calibrate_with_board
 from sfm_calib.boards.load import load_board
+from sfm_calib.boards.spec import Board
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, calibrate
 from sfm_calib.check import check_scan
@@ -143,13 +145,17 @@ def run(command: Command, arguments: Sequence[str]) -> None:
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
     """Calibrate a scan, and compare with the truth where it is given."""
     config = config_of(command.scan, arguments)
+    if command.board_images and not command.board:
+        raise CalibrationError("--board-images needs --board YAML: say what board they show")
+    board = load_board(command.board) if command.board else None
     truth = load_calibration(command.truth) if command.truth else None
     if truth:
         check_same_cameras(camera_names(command.scan), truth)  # now rather than after the work
     with output_folder(command.out):
         outcome = calibrate_into(
-            command.out, command.scan, config, command.fresh, command.verbose, arguments
-        )
+            command.out, command.scan, config, command.fresh, command.verbose, arguments,
+            board, command.board_images,
+        )  # fmt: skip
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
         finish(outcome, command.out, rows, command.json)
 
@@ -229,11 +235,16 @@ def calibrate_into(
     fresh: bool,
     verbose: bool,
     arguments: Sequence[str],
+    board: Board | None = None,
+    board_images: Path | None = None,
 ) -> Outcome:
     """Calibrate with the cache in OUT/cache, under progress bars."""
     quiet(verbose)
     with progress_bars() as progress:
-        return calibrate(scan, config, Cache(out / "cache", fresh), progress, told(arguments))
+        cache, line = Cache(out / "cache", fresh), told(arguments)
+        if board is None:
+            return calibrate(scan, config, cache, progress, line)
+        return calibrate_with_board(scan, board, board_images, config, cache, progress, line)
 
 
 @contextmanager

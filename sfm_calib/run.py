@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from graphs.ladder import Ladder
+from graphs.problem import Problem
 from graphs.refine import Refinement
 from graphs.scale_ledger import NO_SOURCES, ScaleLedger
 from graphs.split_check import SplitCheck
@@ -25,6 +26,7 @@ class Given:
     mapped: Mapped
     command: str
     board: BoardUse | None = None
+    scan_alone: Problem | None = None  # without the board that joined it
 
 
 @dataclass(frozen=True)
