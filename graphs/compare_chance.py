@@ -25,6 +25,7 @@ DRAWS, SEED = 8, 0
 LEAST_SHARE_SEEN = 0.9  # of the pixels: a draw that loses more says nothing
 LEAST_RELATIVE = 1e-5  # sigma of a direction over the largest: less is rounding
 LEAST_SIGMA_PX = 1e-5  # ten times what unprojecting leaves
+ROOM = 3.0  # sigmas, of what a direction that does not count may hold
 NO_CHANGE = Change(Transform.identity())
 
 
@@ -38,7 +39,7 @@ class ChiSquare:
     p_value: float  # of a larger chi2, if the sigmas are true
     difference_px: float  # rms over all images and ranges
     expected_px: float  # rms that the covariances let expect
-    outside_px: float  # rms of what lies along no direction that counts
+    outside_px: float  # rms of what lies along no direction that has a sigma, or beyond it
 
 
 def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
@@ -66,10 +67,14 @@ def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
     if not np.linalg.norm(root) > LEAST_SIGMA_PX * len(root) ** 0.5:
         return None
     vectors, sigma = _directions(root)
-    counts = _nonlinear((a, b), frames, every, kept, without, vectors) <= MOST_NONLINEAR * sigma
+    curvature = _nonlinear((a, b), frames, every, kept, without, vectors)
+    counts = curvature <= MOST_NONLINEAR * sigma
     left = without(apart[kept])
-    along = vectors[:, counts].T @ left
-    chi2, rank = float(((along / sigma[counts]) ** 2).sum()), int(counts.sum())
+    along = vectors.T @ left
+    chi2, rank = float(((along / sigma)[counts] ** 2).sum()), int(counts.sum())
+    # Along the others a difference may be as large as sigma and curvature make it, not larger.
+    reached = counts | (np.abs(along) <= ROOM * np.hypot(sigma, curvature))
+    inside = float(along[reached] @ along[reached])
     n_pixels = int(kept.sum())
     return ChiSquare(
         chi2,
@@ -78,7 +83,7 @@ def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
         float(stats.chi2.sf(chi2, rank)) if rank else 1.0,
         float((left @ left / n_pixels) ** 0.5),
         float(((sigma**2).sum() / n_pixels) ** 0.5),
-        float((max(left @ left - along @ along, 0.0) / n_pixels) ** 0.5),
+        float((max(left @ left - inside, 0.0) / n_pixels) ** 0.5),
     )
 
 
@@ -86,10 +91,10 @@ def _directions(root: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Orthonormal directions (m, k) in the picture and sigmas (k,) along them, of L L' for a root
     L (m, n), but for those that are rounding."""
     values, turned = np.linalg.eigh(root.T @ root)
-    sigma = np.sqrt(np.maximum(values, 0.0))
+    sigma: FloatArray = np.sqrt(np.maximum(values, 0.0))
     stated = sigma > max(LEAST_RELATIVE * float(sigma[-1]), LEAST_SIGMA_PX * len(root) ** 0.5)
-    vectors: FloatArray = root @ turned[:, stated] / sigma[stated]
-    return vectors, sigma[stated]
+    kept: FloatArray = sigma[stated]
+    return root @ turned[:, stated] / kept, kept
 
 
 class _Without:

@@ -73,12 +73,12 @@ def _headline(kind: Kind, record: Comparison) -> str:
         )
     if not chance.rank:
         return (
-            f"{who} cannot tell: the sigmas are so large ({left} rms in the picture) that the "
+            f"{who}: the sigmas are so large ({left} rms in the picture) that the "
             f"difference of {rms} says nothing about chance"
         )
     if kind == "cannot tell":
         return (
-            f"{who} cannot tell: they lie {rms} rms apart in the picture, and the sigmas let "
+            f"{who}: they lie {rms} rms apart in the picture, and the sigmas let "
             f"expect {left} ({p})"
         )
     if chance.p_value > SURPRISING:
@@ -96,7 +96,7 @@ def _headline(kind: Kind, record: Comparison) -> str:
 
 def _who(record: Comparison) -> str:
     states = record.a.states_sigmas, record.b.states_sigmas
-    return "Neither" if all(states) else "A" if states[0] else "B"
+    return "Neither can tell" if all(states) else f"{'A' if states[0] else 'B'} cannot tell"
 
 
 def _without_sigmas(record: Comparison) -> str:
@@ -218,7 +218,8 @@ def _px(value: float) -> str:
 
 
 def _percent(value: float) -> str:
-    return ("+" if value > 0 else "-" if value < 0 else "") + short(abs(value))
+    sign = "+" if value > 0 else "-" if value < 0 else ""
+    return sign + short(float(f"{abs(value):.2g}"))  # 0.998 as 1.0, like its neighbours
 
 
 def p_text(chance: Chance) -> str:
