@@ -25,8 +25,8 @@ from graphs.uncertainty import SHAPE
 
 FIT_SHAPE = (17, 13)  # pixels across and down by which the change of frames is judged; odd: centre
 FAR = 1e6  # in place of infinity, of a camera's distance from the rig's origin
-ITERATIONS = 50
-CONVERGED_PX = 1e-9  # rms step in the picture
+ITERATIONS, HALVINGS = 50, 8
+CONVERGED_PX = 1e-7  # rms step in the picture
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,8 @@ def by_change(
 def fit_change(a: Estimate, b: Estimate, at: Sights, translation: bool, scale: bool) -> Change:
     """The change of frames, and of scale where that is free, that leaves least between A and B.
 
-    Least squares of the pixels by Gauss-Newton, steps halved until they gain. What B does not see
-    counts as far away as the image is wide.
+    Least squares of the pixels by Gauss-Newton, steps shortened until they gain. What B does not
+    see counts as far away as the image is wide.
     """
     change = _start(a, b, sorted({int(index) for index in at.camera}), translation)
     unseen = np.array([np.hypot(*camera.size) for camera in b.cameras])[at.camera, None]
@@ -163,12 +163,15 @@ def fit_change(a: Estimate, b: Estimate, at: Sights, translation: bool, scale: b
     for _ in range(ITERATIONS):
         J = by_change(b, change, at, translation, scale)[1].reshape(len(left), -1)
         size = np.maximum(np.linalg.norm(J, axis=0), np.finfo(np.float64).tiny)
-        step = -np.linalg.lstsq(J / size, left)[0] / size
-        if np.linalg.norm(J @ step) <= CONVERGED_PX * len(left) ** 0.5:
+        J = J / size
+        step = -np.linalg.lstsq(J.T @ J, J.T @ left)[0] / size
+        if np.linalg.norm(J @ (step * size)) <= CONVERGED_PX * len(left) ** 0.5:
             break
         tried = _moved(change, step, translation, scale)
         new = error(tried)
-        while not new @ new <= left @ left and np.linalg.norm(step) > 1e-15:
+        for _ in range(HALVINGS):
+            if new @ new <= left @ left:
+                break
             step = step / 4
             tried = _moved(change, step, translation, scale)
             new = error(tried)

@@ -25,6 +25,7 @@ DRAWS, SEED = 8, 0
 LEAST_SHARE_SEEN = 0.9  # of the pixels: a draw that loses more says nothing
 LEAST_RELATIVE = 1e-5  # sigma of a direction over the largest: less is rounding
 LEAST_SIGMA_PX = 1e-5  # ten times what unprojecting leaves
+ROOM = 3.0  # sigmas, of what a direction that does not count may hold
 NO_CHANGE = Change(Transform.identity())
 
 
@@ -38,17 +39,18 @@ class ChiSquare:
     p_value: float  # of a larger chi2, if the sigmas are true
     difference_px: float  # rms over all images and ranges
     expected_px: float  # rms that the covariances let expect
-    outside_px: float  # rms of what lies along no direction that counts
+    outside_px: float  # rms of what lies along no direction that has a sigma, or beyond it
 
 
 def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
-    """None where neither states a covariance, or no direction of it counts.
+    """None where neither states a covariance that shows in the picture.
 
     The difference y of all pixels is linear in the errors of A and B, y = P (J_b e_b - J_a e_a),
     with P the projection that takes out the change of frames. Along the eigenvectors of its
     covariance it is normal and independent. Counted are those along which drawn errors move the
     picture linearly but for MOST_NONLINEAR of their sigma: what a change of frames all but absorbs
     (a principal point with a rotation) leaves directions so small that curvature fills them.
+    Of sigmas so large that none counts, the rank is 0 and p is 1.
     """
     found = difference(a.estimate, b.estimate, frames)
     every = [index for group in frames.groups for index in group]
@@ -62,30 +64,37 @@ def chi_square(a: Stated, b: Stated, frames: Frames) -> ChiSquare | None:
             without(_by_calibration(b, at, found)[kept] @ b.root),
         ]
     )
-    if not root.any():
+    if not np.linalg.norm(root) > LEAST_SIGMA_PX * len(root) ** 0.5:
         return None
-    vectors, sigma, _ = np.linalg.svd(root, full_matrices=False)
-    stated = sigma > max(LEAST_RELATIVE * sigma[0], LEAST_SIGMA_PX * len(root) ** 0.5)
-    vectors, sigma = vectors[:, stated], sigma[stated]
-    counts = _nonlinear((a, b), frames, every, kept, without, vectors) <= MOST_NONLINEAR * sigma
-    if not counts.any():
-        return None
+    vectors, sigma = _directions(root)
+    curvature = _nonlinear((a, b), frames, every, kept, without, vectors)
+    counts = curvature <= MOST_NONLINEAR * sigma
     left = without(apart[kept])
-    along = vectors[:, counts].T @ left
-    chi2, rank, n_pixels = (
-        float(((along / sigma[counts]) ** 2).sum()),
-        int(counts.sum()),
-        kept.sum(),
-    )
+    along = vectors.T @ left
+    chi2, rank = float(((along / sigma)[counts] ** 2).sum()), int(counts.sum())
+    # Along the others a difference may be as large as sigma and curvature make it, not larger.
+    reached = counts | (np.abs(along) <= ROOM * np.hypot(sigma, curvature))
+    inside = float(along[reached] @ along[reached])
+    n_pixels = int(kept.sum())
     return ChiSquare(
         chi2,
         rank,
         max(len(a.covariance.names), len(b.covariance.names)),
-        float(stats.chi2.sf(chi2, rank)),
+        float(stats.chi2.sf(chi2, rank)) if rank else 1.0,
         float((left @ left / n_pixels) ** 0.5),
         float(((sigma**2).sum() / n_pixels) ** 0.5),
-        float((max(left @ left - along @ along, 0.0) / n_pixels) ** 0.5),
+        float((max(left @ left - inside, 0.0) / n_pixels) ** 0.5),
     )
+
+
+def _directions(root: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal directions (m, k) in the picture and sigmas (k,) along them, of L L' for a root
+    L (m, n), but for those that are rounding."""
+    values, turned = np.linalg.eigh(root.T @ root)
+    sigma: FloatArray = np.sqrt(np.maximum(values, 0.0))
+    stated = sigma > max(LEAST_RELATIVE * float(sigma[-1]), LEAST_SIGMA_PX * len(root) ** 0.5)
+    kept: FloatArray = sigma[stated]
+    return root @ turned[:, stated] / kept, kept
 
 
 class _Without:

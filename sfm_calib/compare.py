@@ -99,6 +99,7 @@ def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
     stated = [bool(side.root.any()) for side in (sides.a, sides.b)]
     ours, theirs = _in_one_scale(sides, found)
     alike, errors_px = _alike(sides.a, sides.b)
+    about = _notes(sides, errors_px, stated, chance is not None)
     record = Comparison(
         a=_side(a, stated[0]),
         b=_side(b, stated[1]),
@@ -116,7 +117,7 @@ def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
             *a.notes,
             *b.notes,
             *sides.notes,
-            *_notes(sides, errors_px, stated, chance is not None),
+            *about,
         ),
         verdict=ComparisonVerdict(kind="same", lines=()),
     )

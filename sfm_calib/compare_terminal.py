@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sfm_calib.compare_record import Comparison, PairDifference, ParameterDifference
+from sfm_calib.compare_verdict import p_text
 from sfm_calib.report.digits import short
 from sfm_calib.terminal import SUSPICIOUS_Z, sigma_text, with_digits
 
@@ -28,7 +29,7 @@ def print_compared(record: Comparison, console: Console) -> None:
         _print(
             console,
             f"chi-square {chance.chi2:.1f} in {chance.rank} directions of the picture that can be "
-            f"judged, of {chance.n_parameters} parameters with sigmas; p = {chance.p_value:.2g}; "
+            f"judged, of {chance.n_parameters} parameters with sigmas; {p_text(chance)}; "
             f"{short(chance.outside_px)} px rms lie where no sigma reaches",
         )
     _print(console, f"taken out: {taken_out(record)}")
@@ -47,7 +48,7 @@ def taken_out(record: Comparison) -> str:
         ]
         return f"a rotation of each camera ({', '.join(turns)})"
     change = record.taken_out[0]
-    scale = "" if change.scale is None else f", B's lengths times {change.scale:.4f} more"
+    scale = "" if change.scale is None else f"; A's unit of length is {change.scale:.5g} of B's"
     return (
         f"one change of frames for all cameras: {short(_length(change.rotation_deg))} deg, "
         f"{short(_length(change.translation))} {record.unit}{scale}"
@@ -66,16 +67,23 @@ def _table(*columns: str) -> Table:
     table = Table()
     for column in columns:
         table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
+    first = table.columns[0]
+    first.justify, first.no_wrap, first.overflow = "left", False, "fold"
     return table
 
 
 def _parameters(record: Comparison) -> Table:
     table = _table("", "A", "B", "B - A", "sigma", "z", "")
+    current = ""
     for row in record.parameters:
+        camera, _, parameter = row.name.rpartition(".")
+        if camera != current and f"{camera}.fx" == row.name:
+            current = camera
+            table.add_section()
+            table.add_row(camera, style="bold")
         sigma = float((row.sigma_a**2 + row.sigma_b**2) ** 0.5)
         table.add_row(
-            row.name,
+            f"  {parameter}" if current == camera else row.name,
             with_digits(row.a, sigma),
             with_digits(row.b, sigma),
             with_digits(row.difference, sigma, "+"),

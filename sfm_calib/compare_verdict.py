@@ -47,6 +47,8 @@ def _kind(record: Comparison) -> Kind:
         return "same"
     if (chance := record.chance) is None:
         return "no sigmas"
+    if not chance.rank:
+        return "cannot tell"
     if chance.p_value <= SURPRISING or _is_outside(chance):
         return "differ"
     return "cannot tell" if chance.difference_px > NOTICED_PX else "agree"
@@ -63,15 +65,20 @@ def _headline(kind: Kind, record: Comparison) -> str:
         return f"The two are the same: no pixel differs by more than {_px(_largest_px(record))}"
     if chance is None:
         return _without_sigmas(record)
-    p, rms, left = _p(chance), _px(chance.difference_px), _px(chance.expected_px)
+    p, rms, left = p_text(chance), _px(chance.difference_px), _px(chance.expected_px)
     if kind == "agree":
         return (
             f"The two agree: nothing differs by more than noise explains ({p}); they lie {rms} rms "
             f"apart in the picture, and their sigmas let expect {left}"
         )
+    if not chance.rank:
+        return (
+            f"{who}: the sigmas are so large ({left} rms in the picture) that the "
+            f"difference of {rms} says nothing about chance"
+        )
     if kind == "cannot tell":
         return (
-            f"{who} cannot tell: they lie {rms} rms apart in the picture, and the sigmas let "
+            f"{who}: they lie {rms} rms apart in the picture, and the sigmas let "
             f"expect {left} ({p})"
         )
     if chance.p_value > SURPRISING:
@@ -89,7 +96,7 @@ def _headline(kind: Kind, record: Comparison) -> str:
 
 def _who(record: Comparison) -> str:
     states = record.a.states_sigmas, record.b.states_sigmas
-    return "Neither" if all(states) else "A" if states[0] else "B"
+    return "Neither can tell" if all(states) else f"{'A' if states[0] else 'B'} cannot tell"
 
 
 def _without_sigmas(record: Comparison) -> str:
@@ -122,14 +129,14 @@ def _size(row: ParameterDifference) -> str:
 
 def _hidden(record: Comparison) -> Iterator[str]:
     """Principal points that moved, and a rotation that undoes it."""
-    turn = "a rotation" if record.unit is None else "a turn of the whole rig"
+    turn = "a rotation hides" if record.unit is None else "how the cameras are turned hides"
     by_name = {row.name: row.difference for row in record.parameters}
     for name, told in record.projection.items():
         shift = float(abs(by_name[f"{name}.cx"] + 1j * by_name[f"{name}.cy"]))
         left = max(one.rms_px for one in told)
         if shift >= SHIFTED_PX and left <= HIDDEN_SHARE * shift:
             yield (
-                f"the principal point of {name} is {_px(shift)} off, but {turn} hides all but "
+                f"the principal point of {name} is {_px(shift)} off, but {turn} all but "
                 f"{_px(left)} (rms) of it"
             )
 
@@ -211,8 +218,10 @@ def _px(value: float) -> str:
 
 
 def _percent(value: float) -> str:
-    return ("+" if value > 0 else "-" if value < 0 else "") + short(abs(value))
+    sign = "+" if value > 0 else "-" if value < 0 else ""
+    return sign + short(float(f"{abs(value):.2g}"))  # 0.998 as 1.0, like its neighbours
 
 
-def _p(chance: Chance) -> str:
+def p_text(chance: Chance) -> str:
+    """The p-value with two digits."""
     return "p < 0.0001" if chance.p_value < 1e-4 else f"p = {chance.p_value:.2g}"

@@ -80,7 +80,7 @@ def _text(path: Path, text: str) -> Read:
         return _xml(path, start)
     if start.startswith("{"):
         return _json(path, start)
-    if start.startswith("%YAML:"):  # OpenCV's alone: YAML itself writes "%YAML 1.2"
+    if start.startswith("%YAML") or "!!opencv-matrix" in text:
         return read_file_storage(path)
     if looks_like_matrices(text):
         return read_matrices(path, text)
