@@ -28,6 +28,7 @@ TIMES_MEDIAN = 4.0
 MOST_PROPOSING = 60  # frames; all of them vote
 # How much less the frames may support the second choice. Clear cases have 3 and more.
 CLEAR_RATIO = 1.5
+SUPPORT_FLOOR = 0.02  # distance a frame, of noise alone
 WEAK_FRAMES = 3  # a link of fewer frames is weak
 
 
@@ -118,7 +119,9 @@ def link(cameras: tuple[int, int], a: Candidates, b: Candidates) -> Link:
         nearest = np.nanmin(np.where(np.isfinite(apart), apart, np.inf), axis=1)
         scores[place] = np.minimum(nearest, FARTHEST).sum()
     preference = np.add.outer(a.cost[_unturned(a)], b.cost).ravel()[tried % k]
-    best = tried[np.lexsort([preference, scores.round(6)])[0]]
+    # Where several are as good, nothing but a guess is left: all boards numbered alike.
+    as_good = scores <= CLEAR_RATIO * max(float(scores.min()), SUPPORT_FLOOR * n)
+    best = tried[np.lexsort([scores, np.where(as_good, preference, np.inf)])[0]]
     return _settled(cameras, proposals, depth, flat, int(best), tried, scores)
 
 
@@ -172,8 +175,8 @@ def _settled(
     typical = float(np.nanmedian(depth))
     rivals = distances(flat[tried], winner, np.array(typical)) > FARTHEST
     own = float(scores[tried == best][0])
-    floor = 0.02 * len(depth)
-    ambiguous = bool(rivals.any()) and scores[rivals].min() < CLEAR_RATIO * max(own, floor)
+    own = max(own, SUPPORT_FLOOR * len(depth))
+    ambiguous = bool(rivals.any()) and scores[rivals].min() < CLEAR_RATIO * own
     return Link(cameras, winner.one(0), len(depth), int(agrees.sum()), bool(ambiguous))
 
 

@@ -115,7 +115,7 @@ def turned(views: list[View], which: Sequence[int]) -> list[View]:
 
 
 def all_known(count: int) -> dict[int, Camera]:
-    return {i: PLAIN for i in range(count)}
+    return {i: replace(PLAIN, name=f"cam{i}") for i in range(count)}
 
 
 # ---- rigs ----------------------------------------------------------------------------------
@@ -171,7 +171,9 @@ def test_one_shared_frame_links_and_is_said_to_be_weak() -> None:
 
 def test_an_unlinked_camera_is_named_with_counts() -> None:
     rng = np.random.default_rng(4)
-    views = rig_views([PLAIN] * 3, [*STEREO, beside(0.2, 0.0)], [waved(rng, 0) for _ in range(9)], rng)
+    views = rig_views(
+        [PLAIN] * 3, [*STEREO, beside(0.2, 0.0)], [waved(rng, 0) for _ in range(9)], rng
+    )
     views = [view for view in views if (view.camera == 2) == (view.frame >= 5)]
     words = (
         "cam2 never sees the board together with cam0, cam1: 4 frames against 5, none of them "
@@ -184,7 +186,9 @@ def test_an_unlinked_camera_is_named_with_counts() -> None:
 def test_partial_views_of_a_rig() -> None:
     """As a ChArUco board half out of the image or covered: six corners and more."""
     rng = np.random.default_rng(5)
-    views = rig_views([PLAIN] * 4, RING, [waved(rng, 45.0 + 90.0 * (i % 4)) for i in range(24)], rng)
+    views = rig_views(
+        [PLAIN] * 4, RING, [waved(rng, 45.0 + 90.0 * (i % 4)) for i in range(24)], rng
+    )
     cut = []
     for view in views:
         rows = np.sort(rng.permutation(len(view.corner))[: rng.integers(6, 20)])
