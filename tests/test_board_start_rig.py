@@ -259,7 +259,7 @@ def test_tilts_that_one_view_leaves_open_are_settled_by_the_rig() -> None:
     ]
     boards = [waved(rng, 0, 40.0) for _ in range(25)]
     views = rig_views([wide] * 3, far, boards, rng, noise_px=0.3)
-    found = start(views, 3, known={i: wide for i in range(3)})
+    found = start(views, 3, known=dict.fromkeys(range(3), wide))
     check_rig(found, far, most_deg=2.0, most_m=0.15)
     assert len(found.kept) > 0.95 * len(views)
     wrong = 0
