@@ -187,4 +187,6 @@ def _place_cameras(
     scene = Scene(seen.cameras, corners.weighted(weight), points, corners.camera, alone)
     placed, _ = fit(scene, rig, FIT_ITERATIONS)
     own = placed[reference : reference + 1]
-    return placed @ own.inverse, own @ boards
+    rig = placed @ own.inverse
+    rig.rotation[reference], rig.translation[reference] = np.eye(3), 0.0  # to the last digit
+    return rig, own @ boards

@@ -40,6 +40,7 @@ FIELDS_DEG: dict[LensName, tuple[float, float, int]] = {
 SWEEP_ITERATIONS = 5
 REFINE_ITERATIONS = 40
 PLACED_ANEW = 3  # times at most
+BADLY_PLACED = 1.5  # times the median rms: the board may be in a wrong place
 WIDEST_DEG = 75.0  # off axis, beyond which no lens on a plane is fitted
 # Soft knowledge, so that what the views leave open stays sane: the focal length in image widths,
 # its factor; the principal point from the centre in image widths; the distortion at the corner.
@@ -178,14 +179,31 @@ def _refined(start: Camera, boards: Transforms | None, corners: Corners) -> _Ref
         boards = solve_views([start], corners).first
     result = _refine(start, boards, corners)
     for _ in range(PLACED_ANEW):
-        both = (solve_views([result.camera], corners, near) for near in (result.boards, None))
-        near, anew = both
-        better = near.first.where(near.first_rms_px <= anew.first_rms_px, anew.first)
-        rms = np.minimum(near.first_rms_px, anew.first_rms_px)
-        if np.all(rms > 0.99 * result.rms_px):
+        better = _placed_anew(result, corners)
+        if better is None:
             break
         result = _refine(result.camera, better, corners)
     return result
+
+
+def _placed_anew(result: _Refined, corners: Corners) -> Transforms | None:
+    """Boards where another place fits better, sought for those that fit badly; None: nowhere."""
+    camera, rms, boards = result.camera, result.rms_px, result.boards
+    bad = np.flatnonzero(rms > BADLY_PLACED * max(float(np.median(rms)), SMALLEST_RMS_PX))
+    both = solve_views([camera], corners, boards)
+    better, found = both.first_rms_px, both.first
+    if bad.size:
+        anew = solve_views([camera], corners.of_views(bad))
+        nearer = np.zeros(len(rms), dtype=bool)
+        nearer[bad] = anew.first_rms_px < better[bad]
+        rotation, translation = found.rotation.copy(), found.translation.copy()
+        of_bad = nearer[bad]
+        rotation[nearer] = anew.first.rotation[of_bad]
+        translation[nearer] = anew.first.translation[of_bad]
+        found = Transforms(rotation, translation)
+        better = better.copy()
+        better[nearer] = anew.first_rms_px[of_bad]
+    return found if np.any(better < 0.99 * rms) else None
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,10 @@ TIMES_MEDIAN = 4.0
 MOST_PROPOSING = 60  # frames; all of them vote
 # How much less the frames may support the second choice. Clear cases have 3 and more.
 CLEAR_RATIO = 1.5
-WEAK_FRAMES = 3  # a link of fewer frames is weak
+SUPPORT_FLOOR = 0.02  # distance a frame, of noise alone
+WEAK_FRAMES, WEAK_SHARE = 3, 0.5  # a link on which fewer frames agree is weak
+REFUSED_SHARE = 0.25  # of ten frames of two boards, 1 to 4 agree by chance
+SETTLING_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,13 @@ class Link:
 
     @property
     def weak(self) -> bool:
-        return self.ambiguous or self.agreeing < WEAK_FRAMES
+        few = max(WEAK_FRAMES, WEAK_SHARE * self.frames)
+        return self.ambiguous or self.agreeing < few
+
+    @property
+    def refused(self) -> bool:
+        """Whether so few frames agree that chance does as well."""
+        return self.agreeing < REFUSED_SHARE * self.frames
 
 
 def distances(a: Transforms, b: Transforms, depth: FloatArray) -> FloatArray:
@@ -119,7 +128,21 @@ def link(cameras: tuple[int, int], a: Candidates, b: Candidates) -> Link:
         scores[place] = np.minimum(nearest, FARTHEST).sum()
     preference = np.add.outer(a.cost[_unturned(a)], b.cost).ravel()[tried % k]
     best = tried[np.lexsort([preference, scores.round(6)])[0]]
-    return _settled(cameras, proposals, depth, flat, int(best), tried, scores)
+    winner = _settled(proposals, depth, flat[best : best + 1])
+    typical = np.array(float(np.nanmedian(depth)))
+    away = distances(flat[tried], winner.b_from_a, typical) > FARTHEST
+    if not away.any():
+        return Link(cameras, winner.b_from_a.one(0), n, winner.agreeing, False)
+    second = tried[away][np.lexsort([preference[away], scores[away].round(6)])[0]]
+    rival = _settled(proposals, depth, flat[second : second + 1])
+    ambiguous = rival.score < CLEAR_RATIO * max(winner.score, SUPPORT_FLOOR * n)
+    if ambiguous:
+        # Nothing but a guess is left: that all boards are numbered alike.
+        beside_rival = distances(flat[tried], rival.b_from_a, typical) < AGREEING
+        beside_winner = distances(flat[tried], winner.b_from_a, typical) < AGREEING
+        least = [preference[near].min(initial=np.inf) for near in (beside_rival, beside_winner)]
+        winner = rival if least[0] < least[1] else winner
+    return Link(cameras, winner.b_from_a.one(0), n, winner.agreeing, bool(ambiguous))
 
 
 def _unturned(candidates: Candidates) -> IntArray:
@@ -146,35 +169,43 @@ def _proposals(a: Candidates, b: Candidates) -> tuple[Transforms, FloatArray]:
     return proposals, np.where(valid, depth, np.nan)
 
 
-def _settled(
-    cameras: tuple[int, int],
-    proposals: Transforms,
-    depth: FloatArray,
-    flat: Transforms,
-    best: int,
-    tried: IntArray,
-    scores: FloatArray,
-) -> Link:
-    """The median of what agrees with the best proposal; ambiguous where a rival is as good."""
-    winner = flat[best : best + 1]
-    for _ in range(2):
-        apart = distances(proposals, winner, depth)
-        apart = np.where(np.isfinite(apart), apart, np.inf)
-        nearest = apart.argmin(1)
-        frames = np.arange(len(apart))
-        closest = apart[frames, nearest]
-        agrees = closest < max(AGREEING, TIMES_MEDIAN * float(np.median(closest)))
-        agrees &= closest < FARTHEST
-        chosen = [proposals[frames, nearest].one(int(i)) for i in np.flatnonzero(agrees)]
-        if not chosen:
+@dataclass(frozen=True)
+class _Consensus:
+    b_from_a: Transforms  # (1,)
+    agreeing: int  # frames
+    score: float  # distances of the frames' nearest proposals, bounded, summed
+
+
+def _settled(proposals: Transforms, depth: FloatArray, start: Transforms) -> _Consensus:
+    """The median of the proposals that agree with a first one (1,), and who agrees with that."""
+    frames = np.arange(len(depth))
+    consensus = start
+    for _ in range(SETTLING_ROUNDS):
+        nearest, closest = _nearest(proposals, depth, consensus)
+        agrees = _agree(closest)
+        chosen = proposals[frames[agrees], nearest[agrees]]
+        if not len(chosen):
             break
-        winner = Transforms.of([median_transform(chosen)])
-    typical = float(np.nanmedian(depth))
-    rivals = distances(flat[tried], winner, np.array(typical)) > FARTHEST
-    own = float(scores[tried == best][0])
-    floor = 0.02 * len(depth)
-    ambiguous = bool(rivals.any()) and scores[rivals].min() < CLEAR_RATIO * max(own, floor)
-    return Link(cameras, winner.one(0), len(depth), int(agrees.sum()), bool(ambiguous))
+        consensus = Transforms.of([median_transform([chosen.one(i) for i in range(len(chosen))])])
+    _, closest = _nearest(proposals, depth, consensus)
+    return _Consensus(
+        consensus, int(_agree(closest).sum()), float(np.minimum(closest, FARTHEST).sum())
+    )
+
+
+def _nearest(
+    proposals: Transforms, depth: FloatArray, to: Transforms
+) -> tuple[IntArray, FloatArray]:
+    """Which proposal of each frame is nearest, and how near (n_frames,)."""
+    apart = distances(proposals, to, depth)
+    apart = np.where(np.isfinite(apart), apart, np.inf)
+    nearest = apart.argmin(1)
+    return nearest, apart[np.arange(len(apart)), nearest]
+
+
+def _agree(closest: FloatArray) -> NDArray[np.bool_]:
+    most = max(AGREEING, TIMES_MEDIAN * float(np.median(closest)))
+    return closest < min(most, FARTHEST)
 
 
 def chained(
@@ -190,7 +221,7 @@ def chained(
         open_links = [
             each
             for each in links
-            if each.agreeing and (each.cameras[0] in found) != (each.cameras[1] in found)
+            if not each.refused and (each.cameras[0] in found) != (each.cameras[1] in found)
         ]
         if not open_links or len(found) == n_cameras:
             return found, used

@@ -127,7 +127,7 @@ def start_from_board(scene: BoardScene) -> BoardStart:
     candidates = Candidates.of(both, turns_of(scene.corners_m, scene.symmetries))
     links = _links(scene, corners, frame, candidates)
     found, used = chained(links, len(cameras), scene.reference)
-    _check_linked(scene, found, corners, frame)
+    _check_linked(scene, found, links, corners, frame)
     rig = [found[index] for index in range(len(cameras))]
     numbers = [np.arange(len(scene.corners_m)), *scene.symmetries]
     rows = np.concatenate([scene.views[v].corner for v in views])
@@ -332,7 +332,11 @@ def _links(
 
 
 def _check_linked(
-    scene: BoardScene, found: Mapping[int, Transform], corners: Corners, frame: IntArray
+    scene: BoardScene,
+    found: Mapping[int, Transform],
+    links: Sequence[Link],
+    corners: Corners,
+    frame: IntArray,
 ) -> None:
     lost = [camera for camera in range(len(scene.names)) if camera not in found]
     if not lost:
@@ -341,12 +345,15 @@ def _check_linked(
     linked = ", ".join(scene.names[camera] for camera in sorted(found))
     ours = np.unique(frame[np.isin(corners.camera, list(found))])
     theirs = np.unique(frame[np.isin(corners.camera, lost)])
-    shared = len(np.intersect1d(ours, theirs))
     verb = "never sees" if len(lost) == 1 else "never see"
-    if shared:
+    refused = [each for each in links if (each.cameras[0] in found) != (each.cameras[1] in found)]
+    if refused:
+        most = max(refused, key=lambda each: each.agreeing)
+        a, b = (scene.names[camera] for camera in most.cameras)
         raise ValueError(
-            f"{names} cannot be placed beside {linked}: no two views of their {shared} shared "
-            "frames agree; check that the cameras are synchronised"
+            f"{names} cannot be placed beside {linked}: at best {most.agreeing} of {most.frames} "
+            f"frames that {a} and {b} share agree on where they stand; check that frames of one "
+            "name are of one moment"
         )
     raise ValueError(
         f"{names} {verb} the board together with {linked}: {len(theirs)} frames against "

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from graphs.board_rows import normal_equations, transform_rows
 from graphs.camera import Camera, lens_arrays, unproject
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import IntArray, project_point_many
@@ -67,6 +68,13 @@ class Transforms:
 
     def one(self, index: int) -> Transform:
         return Transform(self.rotation[index], self.translation[index])
+
+    def whole(self) -> Transforms:
+        """The same as contiguous writable arrays, else numba compiles once more."""
+        rotation, translation = (
+            np.require(each, requirements=["C", "W"]) for each in (self.rotation, self.translation)
+        )
+        return Transforms(rotation, translation)
 
     @staticmethod
     def of(transforms: Sequence[Transform]) -> Transforms:
@@ -247,33 +255,25 @@ class Scene:
 
 
 def residuals(scene: Scene, a_from_b: Transforms) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixel errors (n, 2), their derivatives by the point in a (n, 2, 3), and R x_b (n, 3)."""
-    view = scene.corners.view
-    group = scene.group[view]
-    turned = np.einsum("nij,nj->ni", a_from_b.rotation[group], scene.points)
-    outer = scene.cam_from_a
-    in_cam = np.einsum("nij,nj->ni", outer.rotation[view], turned + a_from_b.translation[group])
-    in_cam = np.ascontiguousarray(in_cam + outer.translation[view])
-    pixels, by_point = np.empty((len(view), 2)), np.empty((len(view), 2, 3))
-    camera = scene.corners.camera[view]
-    project_point_many(*scene.lenses, camera, in_cam, pixels, by_point)
-    error = pixels - scene.corners.pixels
-    unseen = np.isnan(error[:, 0])
-    error[unseen] = UNSEEN_PX / np.sqrt(2)
-    return error, by_point @ outer.rotation[view], turned
+    """Pixel errors (n, 2), derivatives by the point in the camera (n, 2, 3), and R x_b (n, 3)."""
+    corners, outer = scene.corners, scene.cam_from_a
+    n = len(corners.view)
+    turned, in_cam = np.empty((n, 3)), np.empty((n, 3))
+    transform_rows(
+        scene.points, corners.view, scene.group, a_from_b.rotation, a_from_b.translation,
+        outer.rotation, outer.translation, turned, in_cam,
+    )  # fmt: skip
+    pixels, by_point = np.empty((n, 2)), np.empty((n, 2, 3))
+    project_point_many(*scene.lenses, corners.camera[corners.view], in_cam, pixels, by_point)
+    error = pixels - corners.pixels
+    error[np.isnan(error[:, 0])] = UNSEEN_PX / np.sqrt(2)
+    return error, by_point, turned
 
 
 def rms_px(corners: Corners, error: FloatArray) -> FloatArray:
     """Root mean squared length of the pixel errors (n, 2) of each view (n_views,)."""
     result: FloatArray = np.sqrt(corners.means((error**2).sum(1)[:, None])[:, 0])
     return result
-
-
-def _by_group(scene: Scene, values: FloatArray, count: int) -> FloatArray:
-    summed = scene.corners.sums(values)
-    out = np.zeros((count, *summed.shape[1:]))
-    np.add.at(out, scene.group, summed)
-    return out
 
 
 def jacobians(by_point: FloatArray, turned: FloatArray) -> FloatArray:
@@ -290,32 +290,46 @@ def moved(transforms: Transforms, step: FloatArray) -> Transforms:
 
 def fit(scene: Scene, start: Transforms, iterations: int = 20) -> tuple[Transforms, FloatArray]:
     """a_from_b of each group by Levenberg and Marquardt, and the rms in px of each view."""
-    count, weight = len(start), scene.corners.weight
-    damping = np.full(count, DAMPING_START)
-    now = start
+    rows = scene.group[scene.corners.view]
+    weight = scene.corners.weight
+
+    def costs(error: FloatArray) -> FloatArray:
+        squares = weight * (error**2).sum(1)
+        return np.bincount(rows, weights=squares, minlength=len(start)).astype(np.float64)
+
+    now, damping = start.whole(), np.full(len(start), DAMPING_START)
     error, by_point, turned = residuals(scene, now)
-    cost = _by_group(scene, weight * (error**2).sum(1), count)
+    cost = costs(error)
     for _ in range(iterations):
-        jacobian = jacobians(by_point, turned)
-        weighted = weight[:, None, None] * jacobian
-        square = _by_group(scene, np.einsum("nki,nkj->nij", weighted, jacobian), count)
-        slope = _by_group(scene, np.einsum("nki,nk->ni", weighted, error), count)
-        step = -damped_solve(square, slope, damping)
-        tried = moved(now, step)
+        square, slope = _normal(scene, error, by_point, turned, len(start))
+        tried = moved(now, -damped_solve(square, slope, damping))
         tried_error, tried_by_point, tried_turned = residuals(scene, tried)
-        tried_cost = _by_group(scene, weight * (tried_error**2).sum(1), count)
+        tried_cost = costs(tried_error)
         better = tried_cost < cost
         fall = np.where(better, 1 - tried_cost / np.maximum(cost, 1e-300), 0.0)
         damping = np.where(better, damping / 10, damping * 10)
         now = tried.where(better, now)
-        rows = better[scene.group[scene.corners.view]]
-        error[rows], by_point[rows] = tried_error[rows], tried_by_point[rows]
-        turned[rows] = tried_turned[rows]
+        taken = better[rows]
+        error[taken], by_point[taken] = tried_error[taken], tried_by_point[taken]
+        turned[taken] = tried_turned[taken]
         cost = np.where(better, tried_cost, cost)
         if np.all((better & (fall < CONVERGED)) | (~better & (damping > 1.0))):
             break
         damping = np.minimum(damping, DAMPING_MOST)
     return now, rms_px(scene.corners, error)
+
+
+def _normal(
+    scene: Scene, error: FloatArray, by_point: FloatArray, turned: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    square, slope = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    corners = scene.corners
+    normal_equations(
+        corners.view, scene.group, corners.weight, error, by_point, scene.cam_from_a.rotation,
+        turned, square, slope,
+    )  # fmt: skip
+    lower = np.tril(square, -1)
+    return square + np.swapaxes(lower, 1, 2), slope
 
 
 def damped_solve(square: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:

@@ -256,7 +256,9 @@ def test_small_far_boards_have_two_solutions_of_which_one_is_right() -> None:
 
 
 def test_near_tilted_boards_have_one_solution_that_counts() -> None:
-    views, placed = mono_views(PINHOLE, 20, np.random.default_rng(12), (0.4, 0.5), (25.0, 45.0), 0.3)
+    views, placed = mono_views(
+        PINHOLE, 20, np.random.default_rng(12), (0.4, 0.5), (25.0, 45.0), 0.3
+    )
     both = solve_views([PINHOLE], gather(views, BOARD))
     assert (both.second_rms_px > 5 * both.first_rms_px).all()
     for ours, there in zip(both.first.rotation, placed, strict=True):
@@ -287,14 +289,17 @@ def test_no_usable_view_is_an_error_with_its_reason() -> None:
 def test_boards_seen_sideways_by_a_fisheye_are_placed() -> None:
     """Beyond 90 degrees off the axis, where z is negative."""
     rng = np.random.default_rng(15)
-    wide = Camera("cam", "kannala_brandt", (900, 900), nominal_params("kannala_brandt", (900, 900), 250))
+    wide = Camera(
+        "cam", "kannala_brandt", (900, 900), nominal_params("kannala_brandt", (900, 900), 250)
+    )
     sight = np.array([np.sin(1.7), 0.0, np.cos(1.7)])
     x = np.array([np.cos(1.7), 0.0, -np.sin(1.7)])
-    rotation = np.stack([x, np.cross(sight, x), sight], axis=1) @ exp_rotation(np.array([0.5, 0, 0]))
+    rotation = np.stack([x, np.cross(sight, x), sight], axis=1) @ exp_rotation(
+        np.array([0.5, 0, 0])
+    )
     there = Transform(rotation, 0.5 * sight - rotation @ BOARD.mean(0))
     corner, pixels = seen(wide, there, rng)
     assert len(corner) > 20 and ((there @ BOARD)[corner, 2] < 0).sum() > 10
     view = View(0, 0, corner, pixels, np.full(len(corner), NOISE_PX))
     both = solve_views([wide], gather([view], BOARD))
     assert angle_between(both.first.rotation[0], there.rotation) < 0.02
-
