@@ -115,7 +115,9 @@ def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progre
     board = given.board
     if board is not None and given.scan_alone is not None:
         with watch.stage("without the board"):
-            board = replace(board, without=without_board(given.scan_alone, config, ladder))
+            board = replace(
+                board, without=without_board(given.scan_alone, config, ladder, progress)
+            )
     run = Run(
         given.scan, config, given.mapped, refinement, covariance, watch.seconds, given.command,
         ladder, split, certificate, board,
@@ -124,11 +126,17 @@ def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progre
     return Outcome(calibration, refinement, unit)
 
 
-def without_board(scan: Problem, config: RigConfig, ladder: Ladder | None) -> Without | None:
+def without_board(
+    scan: Problem, config: RigConfig, ladder: Ladder | None, progress: Progress
+) -> Without | None:
     """What the scan alone says, through the lens that was chosen with the board; None: nothing."""
+
+    def told(stage: str, done: int, total: int) -> None:
+        progress(f"without the board: {stage}", done, total)
+
     try:
-        alone = solve_problem(scan, config, lambda *_: None, ladder)
-        return Without(alone.estimate, covariance_of(alone, config, lambda *_: None)[0])
+        alone = solve_problem(scan, config, told, ladder)
+        return Without(alone.estimate, covariance_of(alone, config, told)[0])
     except CalibrationError:
         return None
 
