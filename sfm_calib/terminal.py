@@ -22,9 +22,9 @@ from rich.table import Table
 
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
-from sfm_calib.board_terminal import board_lines, with_and_without
 from sfm_calib.images import Progress as Report
 from sfm_calib.report import TruthRow
+from sfm_calib.report.board import board_lines, gains
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.lens_ladder import rung_label
 from sfm_calib.report.weak import Mark, marks_of
@@ -147,7 +147,10 @@ def _print_board(calibration: Calibration, console: Console) -> None:
         return
     for line in board_lines(calibration.board):
         _print_line(console, line)
-    if (table := with_and_without(calibration)) is not None:
+    if rows := gains(calibration):
+        table = _table("", "sigma of the scan", "with the board", "gain", "moved")
+        for row in rows:
+            table.add_row(row.name, row.alone, row.joint, row.gain, row.moved)
         console.print(table)
 
 

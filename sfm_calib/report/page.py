@@ -13,6 +13,7 @@ from plotly.offline import get_plotlyjs
 
 from graphs.problem import Estimate, Problem
 from sfm_calib.files import write_atomically
+from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
 from sfm_calib.report.headline import banner, key_figures, truth_summary
@@ -111,6 +112,7 @@ def render(
         lens_tables=lenses,
         ladder=lens_ladder(calibration),
         rig_tables=rig,
+        board=board_section(calibration, problem, estimate),
         scale_ledger=ledger_section(calibration),
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
