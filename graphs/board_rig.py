@@ -18,16 +18,16 @@ from graphs.lenses import IntArray
 from graphs.planar import BothSolutions, Transforms, angles_between
 from graphs.rig_start import median_transform
 
-# A second solution so much worse in rms is no solution. Distortion not yet known makes the right
-# one up to twice as bad as the wrong one.
+# A second solution so much worse in rms is no solution. Generous: a candidate too many costs time,
+# the right one missing costs its frame.
 PLAUSIBLE_RATIO = 3.0
 # Distances between transforms are radians plus shifts relative to the board's distance.
 FARTHEST = 0.5  # beyond it wrong is wrong
 AGREEING = 0.15  # small far boards are off by so much; wrong combinations mostly by more than 0.5
 TIMES_MEDIAN = 4.0
 MOST_PROPOSING = 60  # frames; all of them vote
-# By how much the second choice's distances may exceed the first's and its images be asked. Clear
-# cases have 3 and more.
+# By how much the second choice's distances may exceed the first's and its images be asked. Near
+# boards have 0.01 against 0.4 a frame, small far ones 0.1 against 0.15.
 RIVAL_RATIO = 2.0
 SUPPORT_FLOOR = 0.02  # distance a frame, of noise alone
 WEAK_FRAMES, WEAK_SHARE = 3, 0.5  # a link on which fewer frames agree is weak
