@@ -35,7 +35,8 @@ MIN_CORNERS = 6
 ON_A_LINE = 0.02  # spread of corners across, relative to along
 SMALLEST_SPREAD_PX = 3.0  # rms across the narrower side: neighbours are about 3 px apart
 # Corners that no homography explains, relative to their spread. Shuffled ones are 0.98 off and
-# more (of six corners, nine in ten more than 0.48); a board that fills a fisheye's 180 degrees 0.24.
+# more (of six corners, nine in ten more than 0.48), a board that fills a fisheye's 180 degrees
+# is 0.24 off.
 SCRAMBLED = 0.4
 FAR_TIMES, FAR_PX, FAR_WIDTHS = 5.0, 1.0, 0.001  # times the camera's median, and at least that
 STEEPEST_DEG = 80.0  # between line of sight and the board's normal; corners blur together there
