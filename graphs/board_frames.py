@@ -34,32 +34,56 @@ class RigFrames:
     odd: NDArray[np.bool_]  # (n_views,) contradict the rest
 
 
-def resolve_frames(
-    cameras: Sequence[Camera],
-    cam_from_rig: Sequence[Transform],
-    reference: int,
-    corners: Corners,
-    frame: IntArray,
-    candidates: Candidates,
-    renumbered: FloatArray,
-) -> RigFrames:
-    """Choose what each view means, then place boards and cameras in turn.
+@dataclass(frozen=True)
+class SeenFrames:
+    """Views of a board by frame, and all that they may mean."""
 
-    frame: (n_views,). renumbered: (n_symmetries, n_corners_in_all_views, 3) the board's corner of
-    each row of `corners` under each renumbering.
-    """
+    cameras: Sequence[Camera]
+    corners: Corners
+    frame: IntArray  # (n_views,)
+    candidates: Candidates
+    turns: Transforms  # (n_symmetries + 1,) renumbered_from_board, the identity first
+
+    def of_pair(self, first: IntArray, second: IntArray) -> SeenFrames:
+        """Only these views of two cameras, which become cameras 0 and 1."""
+        views = np.concatenate([first, second])
+        corners = self.corners.of_views(views)
+        cameras = [self.cameras[int(self.corners.camera[own[0]])] for own in (first, second)]
+        camera = np.repeat([0, 1], [len(first), len(second)])
+        return SeenFrames(
+            cameras,
+            replace(corners, camera=camera),
+            self.frame[views],
+            self.candidates[views],
+            self.turns,
+        )
+
+
+def resolve_frames(
+    seen_frames: SeenFrames, cam_from_rig: Sequence[Transform], reference: int
+) -> RigFrames:
+    """Choose what each view means, then place boards and cameras in turn."""
+    cameras, corners = seen_frames.cameras, seen_frames.corners
+    candidates, frame = seen_frames.candidates, seen_frames.frame
     rig = Transforms.of(cam_from_rig)
     frames, group = np.unique(frame, return_inverse=True)
     for _ in range(PASSES if len(cameras) > 1 else 1):
         boards, chosen, apart = _choose(rig, corners, group, candidates)
         renumbering = candidates.renumbering[chosen]
-        board = renumbered[renumbering[corners.view], np.arange(len(corners.view))]
+        board = _renumbered(corners.board, seen_frames.turns[renumbering[corners.view]])
         seen = _Seen(cameras, replace(corners, board=board), group)
         rig, boards, rms = _settle(seen, rig, boards, _trusted(apart), reference)
     widths = np.array([camera.size[0] for camera in cameras])[corners.camera]
     most = np.maximum(ODD_WIDTHS * widths, ODD_TIMES * float(np.median(rms)))
     boards, rms, odd = _without_odd(seen, rig, boards, rms, most)
     return RigFrames(rig, boards, frames, renumbering, rms, odd)
+
+
+def _renumbered(board: FloatArray, turns: Transforms) -> FloatArray:
+    """Corners (n, 3) turned by each row's own symmetry (n,)."""
+    turned = np.einsum("nij,nj->ni", turns.rotation, board)
+    result: FloatArray = turned + turns.translation
+    return result
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,8 @@ SMALLEST_RMS_PX = 0.05  # of a view; drawn corners are better, but no lens of tw
 OUTLYING = 3.0  # times the median: a view's weight falls to a quarter there
 # A fisheye lens fits a perspective image nearly as well; the plainer one unless it is 10 % worse.
 CLEARLY_BETTER = 0.1
-# Relative sigma of the focal length. Frontal views alone leave 0.3; three good tilted ones 0.01.
+# Relative sigma of the focal length. Frontal views alone leave 0.2 to 0.7, three tilted ones 0.005
+# to 0.02.
 WEAK_FOCAL = 0.05
 
 

@@ -18,16 +18,17 @@ from graphs.lenses import IntArray
 from graphs.planar import BothSolutions, Transforms, angles_between
 from graphs.rig_start import median_transform
 
-# A second solution so much worse in rms is no solution. Distortion not yet known makes the right
-# one up to twice as bad as the wrong one.
+# A second solution so much worse in rms is no solution. Generous: a candidate too many costs time,
+# the right one missing costs its frame.
 PLAUSIBLE_RATIO = 3.0
 # Distances between transforms are radians plus shifts relative to the board's distance.
 FARTHEST = 0.5  # beyond it wrong is wrong
 AGREEING = 0.15  # small far boards are off by so much; wrong combinations mostly by more than 0.5
 TIMES_MEDIAN = 4.0
 MOST_PROPOSING = 60  # frames; all of them vote
-# How much less the frames may support the second choice. Clear cases have 3 and more.
-CLEAR_RATIO = 1.5
+# By how much the second choice's distances may exceed the first's and its images be asked. Near
+# boards have 0.01 against 0.4 a frame, small far ones 0.1 against 0.15.
+RIVAL_RATIO = 2.0
 SUPPORT_FLOOR = 0.02  # distance a frame, of noise alone
 WEAK_FRAMES, WEAK_SHARE = 3, 0.5  # a link on which fewer frames agree is weak
 REFUSED_SHARE = 0.25  # of ten frames of two boards, 1 to 4 agree by chance
@@ -87,7 +88,7 @@ class Link:
     b_from_a: Transform
     frames: int  # that both saw the board in
     agreeing: int  # of those
-    ambiguous: bool  # another place of b fits as well
+    ambiguous: bool = False  # another place of b fits the images as well
 
     @property
     def weak(self) -> bool:
@@ -108,8 +109,10 @@ def distances(a: Transforms, b: Transforms, depth: FloatArray) -> FloatArray:
     return result
 
 
-def link(cameras: tuple[int, int], a: Candidates, b: Candidates) -> Link:
-    """The place of b beside a on which most of their shared frames agree.
+def proposed_links(
+    cameras: tuple[int, int], a: Candidates, b: Candidates
+) -> tuple[Link, Link | None]:
+    """The place of b beside a on which most of their shared frames agree, and its rival, if any.
 
     a, b: the views of the shared frames, in the same order. Only b is renumbered: what matters is
     one numbering relative to the other.
@@ -131,18 +134,14 @@ def link(cameras: tuple[int, int], a: Candidates, b: Candidates) -> Link:
     winner = _settled(proposals, depth, flat[best : best + 1])
     typical = np.array(float(np.nanmedian(depth)))
     away = distances(flat[tried], winner.b_from_a, typical) > FARTHEST
+    link = Link(cameras, winner.b_from_a.one(0), n, winner.agreeing)
     if not away.any():
-        return Link(cameras, winner.b_from_a.one(0), n, winner.agreeing, False)
+        return link, None
     second = tried[away][np.lexsort([preference[away], scores[away].round(6)])[0]]
     rival = _settled(proposals, depth, flat[second : second + 1])
-    ambiguous = rival.score < CLEAR_RATIO * max(winner.score, SUPPORT_FLOOR * n)
-    if ambiguous:
-        # Nothing but a guess is left: that all boards are numbered alike.
-        beside_rival = distances(flat[tried], rival.b_from_a, typical) < AGREEING
-        beside_winner = distances(flat[tried], winner.b_from_a, typical) < AGREEING
-        least = [preference[near].min(initial=np.inf) for near in (beside_rival, beside_winner)]
-        winner = rival if least[0] < least[1] else winner
-    return Link(cameras, winner.b_from_a.one(0), n, winner.agreeing, bool(ambiguous))
+    if rival.score > RIVAL_RATIO * max(winner.score, SUPPORT_FLOOR * n):
+        return link, None
+    return link, Link(cameras, rival.b_from_a.one(0), n, rival.agreeing)
 
 
 def _unturned(candidates: Candidates) -> IntArray:

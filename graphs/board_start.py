@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
 
-from graphs.board_frames import RigFrames, resolve_frames
+from graphs.board_frames import RigFrames, SeenFrames, resolve_frames
 from graphs.board_lens import LensChoice, LensStart, start_lens, views_of
-from graphs.board_rig import Candidates, Link, chained, link, turns_of
+from graphs.board_links import check_linked, links_between
+from graphs.board_rig import Candidates, Link, chained, turns_of
 from graphs.board_thin import thin
 from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
@@ -34,9 +34,10 @@ DropKind = Literal["few", "line", "small", "misdetected", "oblique", "ambiguous"
 MIN_CORNERS = 6
 ON_A_LINE = 0.02  # spread of corners across, relative to along
 SMALLEST_SPREAD_PX = 3.0  # rms across the narrower side: neighbours are about 3 px apart
-# Corners that no homography explains, relative to their spread: shuffled ones reach 0.5 and more,
-# an equidistant lens of 180 degrees filled by the board 0.1.
-SCRAMBLED = 0.25
+# Corners that no homography explains, relative to their spread. Shuffled ones are 0.98 off and
+# more (of six corners, nine in ten more than 0.48), a board that fills a fisheye's 180 degrees
+# is 0.24 off.
+SCRAMBLED = 0.4
 FAR_TIMES, FAR_PX, FAR_WIDTHS = 5.0, 1.0, 0.001  # times the camera's median, and at least that
 STEEPEST_DEG = 80.0  # between line of sight and the board's normal; corners blur together there
 # The second solution's squared error, in noise variances above the first's: less may be chance.
@@ -124,15 +125,13 @@ def start_from_board(scene: BoardScene) -> BoardStart:
     views, corners, both = views[good], corners.of_views(good), _of_views(both, good)
     _check_seen(scene, views, dropped)
     frame = np.array([scene.views[v].frame for v in views])
-    candidates = Candidates.of(both, turns_of(scene.corners_m, scene.symmetries))
-    links = _links(scene, corners, frame, candidates)
+    turns = turns_of(scene.corners_m, scene.symmetries)
+    seen = SeenFrames(cameras, corners, frame, Candidates.of(both, turns), turns)
+    links = links_between(seen)
     found, used = chained(links, len(cameras), scene.reference)
-    _check_linked(scene, found, links, corners, frame)
+    check_linked(scene.names, found, links, seen)
     rig = [found[index] for index in range(len(cameras))]
-    numbers = [np.arange(len(scene.corners_m)), *scene.symmetries]
-    rows = np.concatenate([scene.views[v].corner for v in views])
-    renumbered = np.stack([scene.corners_m[number[rows]] for number in numbers])
-    resolved = resolve_frames(cameras, rig, scene.reference, corners, frame, candidates, renumbered)
+    resolved = resolve_frames(seen, rig, scene.reference)
     _drop_odd(resolved, views, dropped)
     _drop_ambiguous(resolved, corners, both, views, frame, dropped)
     return _assembled(scene, lenses, resolved, views, frame, used, dropped)
@@ -317,48 +316,6 @@ def _lens(scene: BoardScene, corners: Corners, views: IntArray, camera: int) -> 
     some = own[list(thin(seen, LENS_VIEWS, scene.corners_m, scene.sizes))]
     name, size = scene.names[camera], scene.sizes[camera]
     return start_lens(name, size, corners.of_views(some), scene.lens)
-
-
-def _links(
-    scene: BoardScene, corners: Corners, frame: IntArray, candidates: Candidates
-) -> list[Link]:
-    links = []
-    for a, b in combinations(range(len(scene.names)), 2):
-        own_a, own_b = views_of(corners, a), views_of(corners, b)
-        _, first, second = np.intersect1d(frame[own_a], frame[own_b], return_indices=True)
-        if first.size:
-            links.append(link((a, b), candidates[own_a[first]], candidates[own_b[second]]))
-    return links
-
-
-def _check_linked(
-    scene: BoardScene,
-    found: Mapping[int, Transform],
-    links: Sequence[Link],
-    corners: Corners,
-    frame: IntArray,
-) -> None:
-    lost = [camera for camera in range(len(scene.names)) if camera not in found]
-    if not lost:
-        return
-    names = ", ".join(scene.names[camera] for camera in lost)
-    linked = ", ".join(scene.names[camera] for camera in sorted(found))
-    ours = np.unique(frame[np.isin(corners.camera, list(found))])
-    theirs = np.unique(frame[np.isin(corners.camera, lost)])
-    verb = "never sees" if len(lost) == 1 else "never see"
-    refused = [each for each in links if (each.cameras[0] in found) != (each.cameras[1] in found)]
-    if refused:
-        most = max(refused, key=lambda each: each.agreeing)
-        a, b = (scene.names[camera] for camera in most.cameras)
-        raise ValueError(
-            f"{names} cannot be placed beside {linked}: at best {most.agreeing} of {most.frames} "
-            f"frames that {a} and {b} share agree on where they stand; check that frames of one "
-            "name are of one moment"
-        )
-    raise ValueError(
-        f"{names} {verb} the board together with {linked}: {len(theirs)} frames against "
-        f"{len(ours)}, none of them shared; show the board to both at once"
-    )
 
 
 # ---- the result ------------------------------------------------------------------------------
