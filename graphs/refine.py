@@ -28,7 +28,7 @@ from graphs.selection import MIN_TRACK_LENGTH, select_tracks
 from graphs.solve import SolveSummary, solve
 
 # Rough, rough, exact: mismatches are only visible once the lenses are nearly right.
-ROUND_TOLERANCES = (1e-4, 1e-4, 1e-6)
+ROUND_TOLERANCES = (1e-4, 1e-4, 1e-8)
 ROUGH_STEPS, FINAL_STEPS = 20, 100  # at most: what resists in a rough round is mostly mismatches
 # Whatever the final loss: with 5 % of mismatches in the rough rounds, least squares and Huber
 # bend the lens to them (fx 25 and -35 px off, their residuals unremarkable); Cauchy 1 px off.

@@ -16,7 +16,7 @@ from graphs.covariance import Covariance
 from graphs.frames import Transform
 from graphs.ladder import Ladder, RungResult
 from graphs.observability import observe
-from graphs.problem import images_seen, residuals_px
+from graphs.problem import Problem, images_seen, residuals_px
 from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
@@ -232,12 +232,20 @@ def _solve(run: Run) -> result.Solve:
         rms_px=float(np.sqrt(np.nanmean((residuals**2).sum(1)))),
         n_frames=len(refinement.problem.frame_names),
         n_images=len(images_seen(seen)),
-        n_points=len(refinement.estimate.points),
+        n_points=_n_points(refinement.problem),
         n_observations=len(seen),
         n_rejected=refinement.n_rejected,
         selection=_selection(refinement.budget),
         seconds=run.seconds,
     )
+
+
+def _n_points(problem: Problem) -> int:
+    """Points of the scene, and corners of the board, each once."""
+    board = problem.board
+    if board is None:
+        return len(problem.initial.points)
+    return int((~board.known).sum()) + len(np.unique(board.corner[board.known]))
 
 
 def _selection(budget: Budget | None) -> result.Selection | None:

@@ -59,8 +59,8 @@ def calibrate_target(
     with watch.stage("finding the board"):
         found = find_board(scan, board, progress)
     with watch.stage("starting values"):
-        views = diverse(found.views, board, config.video_frames)
-        started = start(views, board, config, scan)
+        views = found.views
+        started = diverse(start(views, board, config, scan), views, board, config.video_frames)
         problem = with_lenses(problem_of(started, views, board, reference_of(scan, config)), config)
     use = BoardUse(
         board,
@@ -82,12 +82,13 @@ def graph_board(board: spec.Board) -> Board:
     return Board(corners, np.zeros(3), np.array([board.relative_sigma, bend, bend]))
 
 
-def diverse(views: BoardViews, board: spec.Board, most: int) -> BoardViews:
+def diverse(started: BoardStart, views: BoardViews, board: spec.Board, most: int) -> BoardStart:
     """Of more frames than `most`, those that differ most in how the board lies in them."""
-    if len({view.frame for view in views.views}) <= most:
-        return views
-    kept = tuple(views.views[i] for i in thin(views.views, most, board.corners_m, views.sizes))
-    return replace(views, views=kept)
+    kept = [views.views[index] for index in started.kept]
+    if len({view.frame for view in kept}) <= most:
+        return started
+    chosen = thin(kept, most, board.corners_m, views.sizes)
+    return replace(started, kept=tuple(started.kept[index] for index in chosen))
 
 
 def start(views: BoardViews, board: spec.Board, config: RigConfig, scan: Scan) -> BoardStart:

@@ -114,12 +114,17 @@ def _of_lens(run: Run) -> Iterator[result.WeakDirection]:
         f"{doubt.label} predicts frames held out no worse than {ladder.best.rung.label}, was not "
         f"taken ({doubt.verdict}), and would move these by up to {by_sigmas:.1f} stated sigmas",
         effect_px=doubt.corner_px,
-        remedy="let things of the scene pass through the corners of the image, or say which lens "
-        "it is (lens)",
+        remedy=f"{_into_the_corners(run)} of the image, or say which lens it is (lens)",
         kind=result.OF_LENS,
         parameters=doubt.parameters,
         moves=doubt.moves,
     )
+
+
+def _into_the_corners(run: Run) -> str:
+    if run.refinement.problem.board_frames.all():
+        return "bring the board into the corners"
+    return "let things of the scene pass through the corners"
 
 
 def _doubts(run: Run) -> list[str]:
