@@ -23,12 +23,22 @@ def detect(image: NDArray[np.uint8], board: Board) -> Detection | None:
 
     Pixels are OpenCV's, with integer centres. Checkerboards and circles are seen whole or nearly
     so, the other types in part as well; fewer than 6 corners are none. The numbering is that of a
-    board seen from its front, up to `board.symmetries`.
+    board seen from its front, up to `board.symmetries`; only a two-sided board is also found from
+    its back.
     """
     if getattr(board, "inverted", False):
         image = 255 - image
     found = _find(np.ascontiguousarray(image), board)
-    return found if found is not None and len(found.corner) >= FEWEST_CORNERS else None
+    if getattr(board, "two_sided", False) and not _is_enough(found):
+        found = _find(np.ascontiguousarray(image[:, ::-1]), board)
+        if found is not None:
+            unmirrored = found.pixels * [-1, 1] + [image.shape[1] - 1, 0]
+            found = Detection(found.corner, unmirrored, found.sigma_px)
+    return found if _is_enough(found) else None
+
+
+def _is_enough(found: Detection | None) -> bool:
+    return found is not None and len(found.corner) >= FEWEST_CORNERS
 
 
 def _find(image: NDArray[np.uint8], board: Board) -> Detection | None:

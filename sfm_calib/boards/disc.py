@@ -20,7 +20,6 @@ GrayImage = NDArray[np.uint8]
 FIRST_BLUR_PX = 0.7  # as for saddles
 SMALLEST_PX = 1.2  # radius: a smaller disc is a dot whose blur cannot be told from its size
 LEAST_CONTRAST = 4.0  # grey levels between black and white, halved
-LEAST_EXPLAINED = 0.6  # of the variance in the window
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def fit_discs(
     start[:, 5] = np.log(FIRST_BLUR_PX)
     windows, fits, found = fit.fit_centres(_model, 6, image, pixels, limits, start)
     good = found & (fits.parameters[:, 6] < -LEAST_CONTRAST)
-    good &= fit.explained(windows, fits) > LEAST_EXPLAINED
+    good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
     radius_px = np.abs(fits.parameters[:, 2] * fits.parameters[:, 4]) ** -0.5
     return Discs(centres, fit.centre_sigmas(fits, windows), radius_px, good)

@@ -19,6 +19,10 @@ FIRST_DAMPING = 1e-3
 RECUT_PX = 0.5  # a window that its centre has moved so far is cut anew
 MOST_SLOPE = 1e8  # grey levels by any parameter: a fit that runs away
 FEWEST_SPARE = 4  # pixels beyond the number of parameters
+# A window is no corner or disc if the fit leaves so much of its variance; or if it leaves some and
+# is far noisier than the others, as where a finger covers a part.
+MOST_LEFT = 0.4
+ODD_NOISE, ODD_SHARE = 6.0, 0.03
 STILL_PX = 1e-3  # a step that moves no centre farther is the last
 PIXEL_PX = 0.3  # sigma of the blur by a pixel's own area, 1 / sqrt(12): no edge is sharper
 LAGS = 2  # px within which a sensor's or a codec's noise is taken to be correlated
@@ -109,12 +113,16 @@ def fit_centres(
     return windows, fits, found
 
 
-def explained(windows: Windows, fits: Fits) -> FloatArray:
-    """Share (n,) of the variance in each window that its fit explains."""
+def is_explained(windows: Windows, fits: Fits) -> NDArray[np.bool_]:
+    """Whether each fit (n,) explains its window: by itself, and beside the others."""
     mean = _mean(windows.values, windows)
     total = ((windows.values - mean[:, None]) ** 2 * windows.counts).sum(axis=1)
-    result: FloatArray = 1 - (fits.residuals**2).sum(axis=1) / np.maximum(total, 1e-9)
-    return result
+    squares = (fits.residuals**2).sum(axis=1)
+    left = squares / np.maximum(total, 1e-9)
+    pixels = np.maximum(windows.counts.sum(axis=1) - fits.parameters.shape[1], 1.0)
+    noise = squares / pixels
+    strange = (noise > ODD_NOISE * np.median(noise)) & (left > ODD_SHARE)
+    return np.asarray((left < MOST_LEFT) & ~strange)
 
 
 def _mean(values: FloatArray, windows: Windows) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,14 @@ from sfm_calib.boards.spec import BOARD_TYPES, Board
 from sfm_calib.config import error_text
 from sfm_calib.errors import CalibrationError
 
-SQUARE_TOLERANCE = (
-    1e-6  # relative; the two spacings of Kalibr's checkerboards are typed, not measured
-)
+SQUARE_TOLERANCE = 1e-6  # relative; both are typed, not measured
 # Kalibr's keys of each target type, as its documentation lists them.
 KALIBR_KEYS = {
     "aprilgrid": ("tagCols", "tagRows", "tagSize", "tagSpacing"),
     "checkerboard": ("targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),
     "circlegrid": ("targetCols", "targetRows", "spacingMeters", "asymmetricGrid"),
 }
+OUR_TYPES = {"aprilgrid": "aprilgrid", "checkerboard": "checkerboard", "circlegrid": "circles"}
 KALIBR_DEFAULTS = {"asymmetricGrid": False}
 
 
@@ -38,14 +38,17 @@ def load_board(path: Path) -> Board:
         )
     try:
         if "target_type" in content:
-            content = _from_kalibr(content)
+            return _from_kalibr(content)
         return board_from(content)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
 
 
-def board_from(content: dict[str, Any]) -> Board:
-    """A board from the keys of our YAML. Raises CalibrationError as load_board does."""
+def board_from(content: dict[str, Any], spell: Callable[[str], str] = str) -> Board:
+    """A board from the keys of our YAML. Raises CalibrationError as load_board does.
+
+    `spell` turns a key into what the user wrote.
+    """
     names = ", ".join(BOARD_TYPES)
     if "type" not in content:
         raise CalibrationError(f"no type: write 'type: checkerboard' or another of {names}")
@@ -57,7 +60,7 @@ def board_from(content: dict[str, Any]) -> Board:
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        raise CalibrationError(_first_problem(error, kind)) from error
+        raise CalibrationError(_first_problem(error, kind, spell)) from error
 
 
 def board_yaml(board: Board) -> str:
@@ -92,13 +95,13 @@ def _read(path: Path) -> object:
         raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
 
 
-def _first_problem(error: ValidationError, kind: type[Board]) -> str:
+def _first_problem(error: ValidationError, kind: type[Board], spell: Callable[[str], str]) -> str:
     """The first validation error as one line, with the nearest valid name for an unknown key."""
     problems = error.errors()
     # A misspelt key is often also a missing one; the misspelling is what to tell.
     unknown = (problem for problem in problems if problem["type"] == "extra_forbidden")
     problem = next(unknown, problems[0])
-    where = ".".join(str(part) for part in problem["loc"])
+    where = spell(".".join(str(part) for part in problem["loc"]))
     if problem["type"] == "extra_forbidden":
         return _unknown_key(where, sorted(kind.model_fields))
     if problem["type"] == "missing":
@@ -118,8 +121,8 @@ def _unknown_key(name: str, valid: list[str]) -> str:
     return f"unknown key {name!r}: {hint}Valid here: {', '.join(valid)}"
 
 
-def _from_kalibr(target: dict[str, Any]) -> dict[str, Any]:
-    """Our keys from those of Kalibr's target YAML."""
+def _from_kalibr(target: dict[str, Any]) -> Board:
+    """A board from the keys of Kalibr's target YAML."""
     kind = str(target["target_type"])
     if kind not in KALIBR_KEYS:
         raise CalibrationError(f"unknown target_type {kind!r}: Kalibr has {', '.join(KALIBR_KEYS)}")
@@ -131,13 +134,18 @@ def _from_kalibr(target: dict[str, Any]) -> dict[str, Any]:
     missing = [name for name in keys if name not in given]
     if missing:
         raise CalibrationError(f"{missing[0]}: is missing, and Kalibr's {kind} needs it")
-    first = [given[name] for name in keys]
+    columns, rows, length, last = (given[name] for name in keys)
+    ours = {"aprilgrid": "tags", "checkerboard": "inner_corners", "circlegrid": "circles"}[kind]
+    content: dict[str, Any] = {"type": OUR_TYPES[kind], ours: [columns, rows]}
     if kind == "aprilgrid":
-        return {"type": kind, "tags": first[:2], "tag_m": first[2], "spacing": first[3]}
-    if kind == "circlegrid":
-        grid = {"circles": first[:2], "spacing_m": first[2], "asymmetric": first[3]}
-        return {"type": "circles", **grid}
-    return {"type": kind, "inner_corners": first[:2], "square_m": _square_side(first[2], first[3])}
+        content |= {"tag_m": length, "spacing": last}
+    elif kind == "circlegrid":
+        content |= {"spacing_m": length, "asymmetric": last}
+    else:
+        content |= {"square_m": _square_side(length, last)}
+    theirs = [f"{ours}.0", f"{ours}.1", *list(content)[2:]]
+    names = dict(zip(theirs, keys, strict=False))
+    return board_from(content, lambda name: names.get(name, name))
 
 
 def _square_side(row_m: object, column_m: object) -> object:

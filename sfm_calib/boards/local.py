@@ -41,6 +41,18 @@ def local_maps(board_m: FloatArray, pixels: FloatArray) -> FloatArray | None:
     return result
 
 
+def misfit(board_m: FloatArray, pixels: FloatArray, maps: FloatArray) -> float:
+    """How far corners typically lie from where their nearest neighbour's map takes them, as a share
+    of the distance to it. Neighbours that do not belong together are as far off as apart."""
+    _, near = cKDTree(board_m).query(board_m, 2)
+    step = board_m[near[:, 1]] - board_m
+    seen = pixels[near[:, 1]] - pixels
+    mean = (maps + maps[near[:, 1]]) / 2
+    expected = np.einsum("nab,nb->na", mean, step)
+    off = np.linalg.norm(seen - expected, axis=1)
+    return float(np.median(off / np.maximum(np.linalg.norm(seen, axis=1), 1e-9)))
+
+
 def _is_line(points: FloatArray) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[1] < FLATTEST * spread[0])

@@ -21,7 +21,6 @@ GrayImage = NDArray[np.uint8]
 NARROWEST_PX, WIDEST_PX = 2.2, 10.0  # radius of the window: fewer pixels say too little
 FIRST_BLUR_PX = 0.7  # sigma; a pixel's own area makes 0.3, lenses and demosaicing the rest
 LEAST_CONTRAST = 4.0  # grey levels between black and white, halved
-LEAST_EXPLAINED = 0.6  # of the variance in the window: what is less is no corner
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def fit_saddles(image: GrayImage, pixels: FloatArray, maps: FloatArray, clear: f
     windows, fits, found = fit.fit_centres(_model, 5, image, pixels, radii, start)
     contrast = fits.parameters[:, 5]
     good = found & (np.abs(contrast) > LEAST_CONTRAST)
-    good &= fit.explained(windows, fits) > LEAST_EXPLAINED
+    good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
     return Saddles(centres, fit.centre_sigmas(fits, windows), contrast, good)
 

@@ -133,6 +133,7 @@ class Charuco(Board):
     dictionary: str = "DICT_4X4_50"
     legacy: bool = False  # the layout of OpenCV before 4.6, which differs for even rows
     inverted: bool = False  # printed with black and white swapped
+    two_sided: bool = False  # on its back the same pattern shows through, mirrored
 
     @field_validator("dictionary")
     @classmethod
@@ -193,6 +194,7 @@ class Aprilgrid(Board):
     border_bits: Annotated[int, Field(ge=1, le=4)] = 2  # width of a tag's black frame
     first_id: Annotated[int, Field(ge=0)] = 0  # of the tag at the bottom left
     inverted: bool = False  # printed with black and white swapped
+    two_sided: bool = False  # on its back the same pattern shows through, mirrored
 
     @field_validator("tags")
     @classmethod
