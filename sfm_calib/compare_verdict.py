@@ -27,6 +27,7 @@ OUTSIDE_SHARE = 0.1
 LARGE_Z = 3.0
 SHIFTED_PX = 1.0  # a principal point that is off by less needs no word
 HIDDEN_SHARE = 0.25  # of the shift, left in the picture
+LEAST_LOST = 0.005  # of the common view: the edge of two lenses
 TYPICAL_RANGE = 5.0  # at which pairs are ranked by what their depths lose
 
 
@@ -195,7 +196,7 @@ def _depths(record: Comparison) -> Iterator[str]:
         f"common view of {pair.cameras[0]} and {pair.cameras[1]}{',' if more else ''}{more})"
     )
     lost = max(one.no_depth_share for one in pair.depth)
-    if lost > 0:
+    if lost > LEAST_LOST:
         yield f"for {lost:.0%} of their common view A finds no depth at all: its rays do not meet"
 
 

@@ -40,7 +40,8 @@ def made(
     """Independent sigmas: sigma_px in the picture from each parameter, more or less."""
     covariance = NOTHING
     if sigma_px:
-        names, sigmas = [], []
+        names: list[str] = []
+        sigmas: list[float] = []
         for camera in cameras:
             names += lens_names(camera)
             sigmas += [sigma_px] * 4 + [sigma_px * 4e-3] * (len(camera.names) - 4)
