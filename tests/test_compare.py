@@ -215,8 +215,8 @@ def test_cameras_match_by_order_where_names_say_nothing() -> None:
 
 def test_cameras_match_as_they_are_told() -> None:
     a, b = made(), made(names("u", "v", "w"), (Transform.identity(), RIGHT, RIGHT.inverse))
-    record = compared(a, b, cameras=("left=u", "right=v"))
-    assert record.verdict.kind == "same"
+    for told in (("left=u", "right=v"), ("left=u,right=v",)):
+        assert compared(a, b, cameras=told).verdict.kind == "same"
     with pytest.raises(CalibrationError, match="no camera 'x'"):
         compared(a, b, cameras=("left=x",))
     with pytest.raises(CalibrationError, match="a camera twice"):

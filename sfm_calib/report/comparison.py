@@ -247,8 +247,9 @@ def _add_pair(figure: go.Figure, pair: PairDifference, colour: str, unit: str | 
             x=ranges,
             y=values,
             mode="lines+markers",
-            name=f"{name}: {kind}",
+            name=name,
             line={"color": colour, "width": 2, "dash": dash},
+            showlegend=kind == "median",
             error_y={
                 "type": "data",
                 "array": [one.sigma_percent or 0.0 for one in told],
