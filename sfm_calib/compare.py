@@ -93,7 +93,8 @@ def compare_files(a: Path, b: Path, options: CompareOptions | None = None) -> Co
 
 def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
     """Compare two calibrations as they were read."""
-    sides = side_by_side(a, b, options.cameras, options.ranges)
+    wanted = [one for entry in options.cameras for one in entry.split(",")]
+    sides = side_by_side(a, b, wanted, options.ranges)
     found = difference(sides.a.estimate, sides.b.estimate, sides.frames)
     chance = chi_square(sides.a, sides.b, sides.frames)
     stated = [bool(side.root.any()) for side in (sides.a, sides.b)]

@@ -135,7 +135,7 @@ def _as_wanted(a: Read, b: Read, wanted: Sequence[str]) -> list[tuple[str, str]]
         pairs.append((one, other))
     for place in (0, 1):
         if len({p[place] for p in pairs}) < len(pairs):
-            raise CalibrationError(f"--cameras {','.join(wanted)} names a camera twice")
+            raise CalibrationError(f"--cameras {' '.join(wanted)} names a camera twice")
     return pairs
 
 

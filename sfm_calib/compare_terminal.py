@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sfm_calib.compare_record import Comparison, PairDifference, ParameterDifference
-from sfm_calib.compare_verdict import p_text
+from sfm_calib.compare_verdict import p_text, px_text
 from sfm_calib.report.digits import short
 from sfm_calib.terminal import SUSPICIOUS_Z, sigma_text, with_digits
 
@@ -30,7 +30,7 @@ def print_compared(record: Comparison, console: Console) -> None:
             console,
             f"chi-square {chance.chi2:.1f} in {chance.rank} directions of the picture that can be "
             f"judged, of {chance.n_parameters} parameters with sigmas; {p_text(chance)}; "
-            f"{short(chance.outside_px)} px rms lie where no sigma reaches",
+            f"{px_text(chance.outside_px)} rms lie where no sigma reaches",
         )
     _print(console, f"taken out: {taken_out(record)}")
     for note in record.notes:

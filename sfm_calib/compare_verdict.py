@@ -18,7 +18,9 @@ from sfm_calib.report.digits import short
 SURPRISING = (
     0.01  # probability below which chance does not explain a difference, as of split halves
 )
+SELDOM = 0.05  # neither chance nor not: said beside the conclusion
 SAME_PX, SAME_PERCENT = 0.01, 0.01  # below: files that round, not calibrations that differ
+LEAST_PX = 1e-3  # no image shows less
 LITTLE_PX = 0.1  # as well as features are located at best
 NOTICED_PX = 1.0  # rms: rectified lines of a stereo pair miss each other
 # Of the difference, outside of what the sigmas reach: this part of what they let expect is
@@ -27,6 +29,7 @@ OUTSIDE_SHARE = 0.1
 LARGE_Z = 3.0
 SHIFTED_PX = 1.0  # a principal point that is off by less needs no word
 HIDDEN_SHARE = 0.25  # of the shift, left in the picture
+LEAST_LOST = 0.005  # of the common view: the edge of two lenses
 TYPICAL_RANGE = 5.0  # at which pairs are ranked by what their depths lose
 
 
@@ -62,14 +65,19 @@ def _is_outside(chance: Chance) -> bool:
 def _headline(kind: Kind, record: Comparison) -> str:
     chance, who = record.chance, _who(record)
     if kind == "same":
-        return f"The two are the same: no pixel differs by more than {_px(_largest_px(record))}"
+        return f"The two are the same: no pixel differs by as much as {SAME_PX:g} px"
     if chance is None:
         return _without_sigmas(record)
-    p, rms, left = p_text(chance), _px(chance.difference_px), _px(chance.expected_px)
+    p, rms, left = p_text(chance), px_text(chance.difference_px), px_text(chance.expected_px)
     if kind == "agree":
+        agree = (
+            f"agree, if only just: noise seldom explains as much ({p})"
+            if chance.p_value < SELDOM
+            else f"agree: nothing differs by more than noise explains ({p})"
+        )
         return (
-            f"The two agree: nothing differs by more than noise explains ({p}); they lie {rms} rms "
-            f"apart in the picture, and their sigmas let expect {left}"
+            f"The two {agree}; they lie {rms} rms apart in the picture, and their sigmas let "
+            f"expect {left}"
         )
     if not chance.rank:
         return (
@@ -79,12 +87,12 @@ def _headline(kind: Kind, record: Comparison) -> str:
     if kind == "cannot tell":
         return (
             f"{who}: they lie {rms} rms apart in the picture, and the sigmas let "
-            f"expect {left} ({p})"
+            f"expect {left} ({p}{', chance seldom does as much' * (chance.p_value < SELDOM)})"
         )
     if chance.p_value > SURPRISING:
         return (
-            f"They differ where no sigma reaches, by {_px(chance.outside_px)} rms: another lens "
-            f"model, or parameters that were held. What the sigmas cover agrees ({p})"
+            f"They differ where no sigma reaches, by {px_text(chance.outside_px)} rms: another "
+            f"lens model, or parameters that were held. What the sigmas cover agrees ({p})"
         )
     if chance.difference_px < LITTLE_PX:
         return (
@@ -107,7 +115,7 @@ def _without_sigmas(record: Comparison) -> str:
         else "no sigma can be trusted in the picture"
     )
     so = "practically the same in the picture" if far < LITTLE_PX else "apart in the picture"
-    return f"They are {so}, up to {_px(far)} rms; {why}: whether by chance cannot be said"
+    return f"They are {so}, up to {px_text(far)} rms; {why}: whether by chance cannot be said"
 
 
 def _what(record: Comparison) -> str:
@@ -136,8 +144,8 @@ def _hidden(record: Comparison) -> Iterator[str]:
         left = max(one.rms_px for one in told)
         if shift >= SHIFTED_PX and left <= HIDDEN_SHARE * shift:
             yield (
-                f"the principal point of {name} is {_px(shift)} off, but {turn} all but "
-                f"{_px(left)} (rms) of it"
+                f"the principal point of {name} is {px_text(shift)} off, but {turn} all but "
+                f"{px_text(left)} (rms) of it"
             )
 
 
@@ -146,7 +154,7 @@ def _picture(record: Comparison) -> Iterator[str]:
     name, told = max(record.projection.items(), key=lambda entry: _worst_rms(entry[1]))
     if record.unit is None:
         yield (
-            f"in the picture {_px(told[0].rms_px)} rms and up to {_px(told[0].max_px)} "
+            f"in the picture {px_text(told[0].rms_px)} rms and up to {px_text(told[0].max_px)} "
             f"({name}{_most(record)}), after the best rotation"
         )
         return
@@ -195,7 +203,7 @@ def _depths(record: Comparison) -> Iterator[str]:
         f"common view of {pair.cameras[0]} and {pair.cameras[1]}{',' if more else ''}{more})"
     )
     lost = max(one.no_depth_share for one in pair.depth)
-    if lost > 0:
+    if lost > LEAST_LOST:
         yield f"for {lost:.0%} of their common view A finds no depth at all: its rays do not meet"
 
 
@@ -213,8 +221,9 @@ def _unit(record: Comparison) -> str:
     return "baselines" if record.unit == "baseline" else "m"
 
 
-def _px(value: float) -> str:
-    return f"{short(value)} px"
+def px_text(value: float) -> str:
+    """Pixels with two digits, down to a thousandth."""
+    return f"{short(value)} px" if value >= LEAST_PX else f"less than {LEAST_PX:g} px"
 
 
 def _percent(value: float) -> str:

@@ -40,7 +40,8 @@ def made(
     """Independent sigmas: sigma_px in the picture from each parameter, more or less."""
     covariance = NOTHING
     if sigma_px:
-        names, sigmas = [], []
+        names: list[str] = []
+        sigmas: list[float] = []
         for camera in cameras:
             names += lens_names(camera)
             sigmas += [sigma_px] * 4 + [sigma_px * 4e-3] * (len(camera.names) - 4)
@@ -214,8 +215,8 @@ def test_cameras_match_by_order_where_names_say_nothing() -> None:
 
 def test_cameras_match_as_they_are_told() -> None:
     a, b = made(), made(names("u", "v", "w"), (Transform.identity(), RIGHT, RIGHT.inverse))
-    record = compared(a, b, cameras=("left=u", "right=v"))
-    assert record.verdict.kind == "same"
+    for told in (("left=u", "right=v"), ("left=u,right=v",)):
+        assert compared(a, b, cameras=told).verdict.kind == "same"
     with pytest.raises(CalibrationError, match="no camera 'x'"):
         compared(a, b, cameras=("left=x",))
     with pytest.raises(CalibrationError, match="a camera twice"):

@@ -233,7 +233,8 @@ def test_sigmas_of_places_are_those_of_both_sides() -> None:
 
 def covariance_of(estimate: Estimate, size: float = 1.0) -> Covariance:
     """Correlated, as large as a good calibration's."""
-    names, scale = [], []
+    names: list[str] = []
+    scale: list[float] = []
     for camera in estimate.cameras:
         names += lens_names(camera)
         scale += [1.0, 1.0, 1.0, 1.0, *[2e-3] * (len(camera.names) - 4)]

@@ -15,6 +15,7 @@ from plotly.offline import get_plotlyjs
 from graphs.compare import Difference
 from sfm_calib.compare_record import Comparison, Kind, PairDifference, ParameterDifference
 from sfm_calib.compare_terminal import at_range, signed_percent, taken_out
+from sfm_calib.compare_verdict import p_text, px_text
 from sfm_calib.files import write_atomically
 from sfm_calib.report.digits import decimals_for, number, short
 from sfm_calib.report.image_plane import arrows, in_image
@@ -99,6 +100,8 @@ def render_comparison(record: Comparison, found: Difference) -> str:
         cameras=camera_maps(record, found),
         depth_figure=figure_html(depth_figure(record), "depth") if _has_depth(record) else "",
         at_range=at_range,
+        p_text=p_text,
+        px_text=px_text,
         short=lambda value: NONE if value is None else short(value),
         percent=lambda value: NONE if value is None else signed_percent(value),
         plotly_js=Markup(get_plotlyjs()),
@@ -244,8 +247,9 @@ def _add_pair(figure: go.Figure, pair: PairDifference, colour: str, unit: str | 
             x=ranges,
             y=values,
             mode="lines+markers",
-            name=f"{name}: {kind}",
+            name=name,
             line={"color": colour, "width": 2, "dash": dash},
+            showlegend=kind == "median",
             error_y={
                 "type": "data",
                 "array": [one.sigma_percent or 0.0 for one in told],
