@@ -10,7 +10,7 @@ import numpy as np
 from graphs.boards import N_SHAPE, corners_of
 from graphs.camera import Camera, project, project_jacobian
 from graphs.covariance import POSE_NAMES, Covariance
-from graphs.frames import FloatArray, Transform, skew
+from graphs.frames import FloatArray, Transform, log_rotation, skew
 from graphs.problem import Board
 from sfm_calib.boards.views import BoardViews
 
@@ -29,7 +29,6 @@ class PeerCalibration:
     covariance: Covariance
     rms_px: float  # of the distances between seen and projected corners
     n_left_out: int = 0  # corners
-    remarks: tuple[str, ...] = ()
     seconds: float = field(default=0.0, compare=False)
 
     @property
@@ -38,8 +37,6 @@ class PeerCalibration:
 
         Of rotations the values are rotation vectors of cam_from_rig in radians.
         """
-        from graphs.frames import log_rotation
-
         found = {
             f"{camera.name}.{name}": value
             for camera in self.cameras
@@ -90,7 +87,7 @@ def gauss_newton_covariance(
     places of boards always were. sigma_px: of a coordinate; estimated from the residuals, less
     the unknowns, where it is not given.
     """
-    jacobian, residual = _linearised(calibration, views, corners, free)
+    jacobian, residual = linearised(calibration, views, corners, free)
     if sigma_px is None:
         sigma_px = float(np.sqrt(residual @ residual / (len(residual) - jacobian.shape[1])))
     scale = np.linalg.norm(jacobian, axis=0)
@@ -100,7 +97,7 @@ def gauss_newton_covariance(
     return Covariance(tuple(free), whole[:n, :n])
 
 
-def _linearised(
+def linearised(
     calibration: PeerCalibration, views: BoardViews, corners: FloatArray, free: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
     """Jacobian (n, m) and residuals (n,); columns: `free`, then the places of the frames."""

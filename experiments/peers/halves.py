@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,3 +61,12 @@ def z_scores(a: PeerCalibration, b: PeerCalibration) -> dict[str, float]:
         for name in first
         if name in second
     }
+
+
+def splits(
+    frames: Sequence[int], n_random: int, seed: int = 0
+) -> list[tuple[list[int], list[int]]]:
+    """Every second frame and the others; then so many random halves."""
+    rng = np.random.default_rng(seed)
+    orders = [list(frames), *(rng.permutation(frames).tolist() for _ in range(n_random))]
+    return [(sorted(order[::2]), sorted(order[1::2])) for order in orders]

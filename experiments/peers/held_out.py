@@ -14,6 +14,7 @@ from experiments.peers.sightings import frames_of, of_frames
 from graphs.boards import corners_of
 from graphs.camera import project
 from graphs.frames import FloatArray, Transform, exp_rotation
+from graphs.problem import IntArray
 from sfm_calib.boards.views import BoardView, BoardViews
 
 Calibrate = Callable[[BoardViews], PeerCalibration]
@@ -24,7 +25,7 @@ class HeldOut:
     """Lengths of the residuals of all corners, each of a calibration without its frame."""
 
     lengths_px: FloatArray  # (n,)
-    frame: FloatArray  # (n,) of each
+    frame: IntArray  # (n,) of each
 
     @property
     def rms_px(self) -> float:
@@ -34,14 +35,25 @@ class HeldOut:
     def median_px(self) -> float:
         return float(np.median(self.lengths_px))
 
+    def less(self, other: HeldOut) -> tuple[float, float]:
+        """Mean square (px^2) of this less another's of the same views, and its standard error.
 
-def held_out(
-    views: BoardViews, corners: FloatArray, calibrate: Calibrate, n_folds: int
-) -> HeldOut:
+        Frames are independent, corners of a frame are not.
+        """
+        frames = np.unique(self.frame)
+        squares = [
+            [float((each.lengths_px[each.frame == frame] ** 2).mean()) for frame in frames]
+            for each in (self, other)
+        ]
+        change = np.array(squares[0]) - np.array(squares[1])
+        return float(change.mean()), float(change.std(ddof=1) / len(frames) ** 0.5)
+
+
+def held_out(views: BoardViews, corners: FloatArray, calibrate: Calibrate, n_folds: int) -> HeldOut:
     """Residuals of every frame under a calibration of the others, in folds of every n-th frame.
 
     The board is placed in a frame left out by least squares, at once for all its cameras; its
-    bends are the calibration's. Only frames that all cameras see are left out.
+    bends are the calibration's.
     """
     frames = frames_of(views)
     lengths, owner = [], []

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from experiments.peers.calibrations import (
     PeerCalibration,
@@ -15,12 +16,12 @@ from experiments.peers.calibrations import (
     residuals_of,
     rms,
 )
-from experiments.peers.sightings import frames_of, of_camera
+from experiments.peers.sightings import of_camera
 from graphs.boards import N_SHAPE
 from graphs.camera import Camera
 from graphs.covariance import POSE_NAMES, Covariance
 from graphs.frames import FloatArray, Transform, exp_rotation
-from graphs.lenses import LensName
+from graphs.lenses import FOCAL_AND_CENTRE, LENSES, LensName
 from sfm_calib.boards.views import BoardView, BoardViews
 
 _NO_K3, _NO_TANGENT = cv2.CALIB_FIX_K3, cv2.CALIB_ZERO_TANGENT_DIST
@@ -32,6 +33,7 @@ FLAGS: dict[LensName, int] = {
     "rational": cv2.CALIB_RATIONAL_MODEL,
 }
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
+SingleArray = NDArray[np.float32]
 # OpenCV's own criteria stop after 30 steps or a change of 2e-16.
 CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
@@ -49,7 +51,7 @@ def calibrate_camera(views: BoardViews, corners: FloatArray, lens: LensName) -> 
     )
     camera = _camera(name, lens, size, K, coefficients)
     names = camera.names
-    by_name = dict(zip((*("fx", "fy", "cx", "cy"), *DISTORTION), sigmas.ravel(), strict=False))
+    by_name = dict(zip((*FOCAL_AND_CENTRE, *DISTORTION), sigmas.ravel(), strict=False))
     stated = np.diag([by_name[each] ** 2 for each in names])
     placed = {
         view.frame: _transform(turn, shift)
@@ -85,9 +87,7 @@ def calibrate_pair(
         [each[frame].pixels[:, None].astype(np.float32) for frame in shared] for each in by_frame
     ]
     start = [_matrices(calibration.cameras[0]) for calibration in alone]
-    flags = (
-        FLAGS[lens] | cv2.CALIB_USE_INTRINSIC_GUESS if refined else cv2.CALIB_FIX_INTRINSIC
-    )
+    flags = FLAGS[lens] | cv2.CALIB_USE_INTRINSIC_GUESS if refined else cv2.CALIB_FIX_INTRINSIC
     _, K1, d1, K2, d2, R, t, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
         boards, *seen, *start[0], *start[1], views.sizes[0], None, None,
         flags=flags, criteria=CRITERIA,
@@ -135,7 +135,7 @@ def _finished(
 
 def _points(
     views: Sequence[BoardView], corners: FloatArray
-) -> tuple[list[FloatArray], list[FloatArray]]:
+) -> tuple[list[SingleArray], list[SingleArray]]:
     # OpenCV takes single precision here, and nothing else: 3e-5 px in a thousand.
     boards = [corners[view.corner].astype(np.float32) for view in views]
     return boards, [view.pixels[:, None].astype(np.float32) for view in views]
@@ -146,15 +146,8 @@ def _camera(
 ) -> Camera:
     known = dict(zip(DISTORTION, np.ravel(coefficients).tolist(), strict=False))
     start = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    names = lens_names(lens)[4:]
+    names = LENSES[lens].coefficients
     return Camera(name, lens, size, np.array([*start, *(known[each] for each in names)]))
-
-
-def lens_names(lens: LensName) -> tuple[str, ...]:
-    """Parameters of a lens, in order."""
-    from graphs.lenses import PARAMETER_NAMES
-
-    return PARAMETER_NAMES[lens]
 
 
 def _matrices(camera: Camera) -> tuple[FloatArray, FloatArray]:
@@ -176,6 +169,3 @@ def place_board(camera: Camera, view: BoardView, board: FloatArray) -> Transform
     _, turn, shift = cv2.solvePnP(points, pixels, K, coefficients, flags=cv2.SOLVEPNP_ITERATIVE)
     turn, shift = cv2.solvePnPRefineLM(points, pixels, K, coefficients, turn, shift)
     return _transform(turn, shift)
-
-
-__all__ = ["calibrate_camera", "calibrate_pair", "frames_of", "place_board"]

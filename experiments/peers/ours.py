@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import gtsam
 import numpy as np
 
 from experiments.peers.calibrations import (
@@ -18,13 +18,13 @@ from experiments.peers.calibrations import (
 )
 from experiments.peers.opencv import place_board
 from experiments.peers.sightings import frames_of
-from graphs.build import GraphOptions, build
+from graphs.build import CalibrationGraph, GraphOptions, build
 from graphs.camera import Camera
-from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.losses import LossName
-from graphs.priors import LensPrior
-from graphs.problem import Board, BoardPoints, Estimate, Observations, Problem
+from graphs.noise import free_dimensions
+from graphs.priors import LensPrior, weak_lens_prior
+from graphs.problem import Board, BoardPoints, Estimate, Observations, Problem, residuals_px
 from graphs.refine import noise_of, refine
 from graphs.solve import solve
 from graphs.stated_covariance import calibration_covariance
@@ -46,6 +46,7 @@ class OurOptions:
     bend_sigma: float = 0.0  # of the board's bends, of half its longer side; 0: flat
     size_sigma: float = 0.0  # of the board's size, relative
     loss: LossName = "cauchy"  # where not like OpenCV
+    tangential_sigma: float | None = None  # of the prior on p1 and p2; None: as for scans
     blocks: bool = True  # whether the jackknife is made
     sigmas: SigmaKind = "stated"
 
@@ -60,16 +61,12 @@ def calibrate(
     begin = time.perf_counter()
     problem = problem_of(views, corners, start, options)
     if options.like_opencv:
-        priors = tuple(unbelieving(camera) for camera in start.cameras)
-        graph_options = GraphOptions(loss="none", lens_priors=priors, sigma_px=noise_of(problem))
-        for _ in range(2):  # the first brings the noise
-            graph = build(problem, graph_options)
-            estimate, values, _ = solve(graph, EXACT_STEPS, EXACT_TOLERANCE)
-            problem = replace(problem, initial=estimate)
-            graph_options = replace(graph_options, sigma_px=_rms_sigma(problem, graph_options))
+        graph, estimate, values = _least_squares(problem)
         n_left_out, kept = 0, problem
     else:
-        refinement = refine(problem, GraphOptions(loss=options.loss), MIN_PARALLAX_DEG)
+        priors = tuple(believing(camera, options) for camera in start.cameras)
+        graph_options = GraphOptions(loss=options.loss, lens_priors=priors)
+        refinement = refine(problem, graph_options, MIN_PARALLAX_DEG)
         graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
         n_left_out, kept = refinement.n_rejected, refinement.problem
     covariance = calibration_covariance(
@@ -78,8 +75,7 @@ def calibrate(
     chosen = covariance.stated if options.sigmas == "stated" else covariance.model
     frame_of = {name: index for index, name in enumerate(views.frames)}
     placed = {
-        frame_of[name]: t
-        for name, t in zip(kept.frame_names, estimate.rig_from_world, strict=True)
+        frame_of[name]: t for name, t in zip(kept.frame_names, estimate.rig_from_world, strict=True)
     }
     shape = np.zeros(3) if estimate.board_shape is None else estimate.board_shape
     found = PeerCalibration(
@@ -98,10 +94,19 @@ def with_bends_sigma(
     return {name: sigma[name] for name in SHAPE_NAMES[1:]}
 
 
-def _rms_sigma(problem: Problem, options: GraphOptions) -> float:
-    from graphs.noise import free_dimensions
-    from graphs.problem import residuals_px
+def _least_squares(problem: Problem) -> tuple[CalibrationGraph, Estimate, gtsam.Values]:
+    """The optimum of all corners alike and no belief in the lenses."""
+    priors = tuple(unbelieving(camera) for camera in problem.initial.cameras)
+    options = GraphOptions(loss="none", lens_priors=priors, sigma_px=noise_of(problem))
+    for _ in range(2):  # the first brings the noise
+        graph = build(problem, options)
+        estimate, values, _ = solve(graph, EXACT_STEPS, EXACT_TOLERANCE)
+        problem = replace(problem, initial=estimate)
+        options = replace(options, sigma_px=_rms_sigma(problem, options))
+    return graph, estimate, values
 
+
+def _rms_sigma(problem: Problem, options: GraphOptions) -> float:
     left = residuals_px(problem.initial, problem.observations)
     spare = left.size - free_dimensions(problem, options)
     return float(np.sqrt((left**2).sum() / spare))
@@ -113,6 +118,15 @@ def unbelieving(camera: Camera) -> LensPrior:
     sigma = np.full(n, NO_BELIEF)
     sigma[:4] = NO_BELIEF_PX
     return LensPrior(camera.params.copy(), sigma)
+
+
+def believing(camera: Camera, options: OurOptions) -> LensPrior:
+    """Our weak prior, its belief in tangential terms perhaps another."""
+    weak = weak_lens_prior(camera)
+    if options.tangential_sigma is None:
+        return weak
+    tangential = np.isin(camera.names, ("p1", "p2"))
+    return replace(weak, sigma=np.where(tangential, options.tangential_sigma, weak.sigma))
 
 
 def problem_of(
@@ -151,11 +165,3 @@ def _placed(
     view = next(view for view in views.views if view.frame == frame)
     cam_from_board = place_board(start.cameras[view.camera], view, corners)
     return start.cam_from_rig[view.camera].inverse @ cam_from_board
-
-
-def joined_start(parts: Sequence[PeerCalibration]) -> PeerCalibration:
-    """The first of several results that has sigmas of everything."""
-    return next(part for part in parts if part.covariance.names)
-
-
-__all__ = ["Covariance", "OurOptions", "calibrate", "with_bends_sigma"]
