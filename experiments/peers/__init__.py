@@ -1,0 +1,1 @@
+"""Calibration from a target beside its peers, on the same corners: ours, OpenCV's, mrcal's."""

@@ -1,0 +1,158 @@
+"""Target images on disk as views of a board, and the half turns that a symmetric board leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphs.frames import FloatArray, Transform, angle_between
+from sfm_calib.boards.spec import Board
+from sfm_calib.boards.views import BoardView, BoardViews
+
+IMAGES = ("*.png", "*.jpg")
+DETECTOR_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+CORNER_SIGMA_PX = 0.1  # of every corner: all are weighed alike
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Images of a board: one folder a camera, files of one number are one frame."""
+
+    folder: str  # below the data
+    cameras: tuple[str, ...]
+    board: Board
+
+
+DATA_SETS = {
+    "opencv_stereo": DataSet(
+        "opencv_stereo",
+        ("left", "right"),
+        Board(type="checkerboard", columns=9, rows=6, square_m=1.0),  # unit squares
+    ),
+    "corridor_stereo": DataSet(
+        "corridor_stereo/boards",
+        ("left", "right"),
+        Board(type="checkerboard", columns=8, rows=6, square_m=0.025),
+    ),
+}
+
+
+def sightings(data: Path, data_set: DataSet) -> BoardViews:
+    """All views of the board in which all corners are found.
+
+    Raises FileNotFoundError where a camera has no image.
+    """
+    found: dict[str, dict[int, FloatArray]] = {}
+    sizes: list[tuple[int, int]] = []
+    for index, name in enumerate(data_set.cameras):
+        folder = data / data_set.folder / name
+        paths = sorted(path for pattern in IMAGES for path in folder.glob(pattern))
+        if not paths:
+            raise FileNotFoundError(f"{folder} has no images: give the folder that has the data")
+        for path in paths:
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            pixels = corners_in(image, data_set.board)
+            if len(sizes) == index:
+                sizes.append((image.shape[1], image.shape[0]))
+            if pixels is not None:
+                found.setdefault(_number(path.stem), {})[index] = pixels
+    frames = sorted(found)
+    views = tuple(
+        _view(camera, frame, found[frames[frame]][camera])
+        for frame in range(len(frames))
+        for camera in sorted(found[frames[frame]])
+    )
+    names = tuple(frames)
+    return BoardViews(data_set.cameras, tuple(sizes), names, views)
+
+
+def _number(stem: str) -> str:
+    """What is left of a file's name without its camera's: left07 and right07 are one frame."""
+    return "".join(character for character in stem if character.isdigit())
+
+
+def corners_in(image: FloatArray, board: Board) -> FloatArray | None:
+    """All corners (n, 2) of a chessboard in a grey image, row by row; None: not all are seen."""
+    size = (board.columns, board.rows)
+    seen, pixels = cv2.findChessboardCornersSB(image, size, flags=DETECTOR_FLAGS)
+    return pixels.reshape(-1, 2).astype(np.float64) if seen else None
+
+
+def _view(camera: int, frame: int, pixels: FloatArray) -> BoardView:
+    n = len(pixels)
+    return BoardView(camera, frame, np.arange(n), pixels, np.full(n, CORNER_SIGMA_PX))
+
+
+def of_frames(views: BoardViews, frames: Sequence[int]) -> BoardViews:
+    """The views of some frames; frames keep their numbers."""
+    chosen = set(frames)
+    return replace(views, views=tuple(view for view in views.views if view.frame in chosen))
+
+
+def of_camera(views: BoardViews, camera: int) -> BoardViews:
+    """The views of one camera, as if there were no other; frames keep their numbers."""
+    kept = tuple(replace(view, camera=0) for view in views.views if view.camera == camera)
+    return BoardViews((views.cameras[camera],), (views.sizes[camera],), views.frames, kept)
+
+
+def frames_of(views: BoardViews) -> list[int]:
+    """Frames that have a view."""
+    return sorted({view.frame for view in views.views})
+
+
+def consistent(
+    views: BoardViews, board: Board, cam_from_board: Sequence[Transform]
+) -> tuple[BoardViews, int]:
+    """The views with corners so numbered that the cameras agree, and how many were renumbered.
+
+    cam_from_board: of each view, as numbered now. A symmetric board may be numbered either way
+    round in each image; between the first camera and another one, the turn must be the same in all
+    frames. The first camera's numbers stay. Frames that a camera shares with none stay, too.
+    """
+    if not board.symmetries:
+        return views, 0
+    half_turn = _half_turn(board)
+    renumbered, count = list(views.views), 0
+    place = {(view.camera, view.frame): index for index, view in enumerate(views.views)}
+    for camera in range(1, len(views.cameras)):
+        shared = [frame for (other, frame) in place if other == camera and (0, frame) in place]
+        options = []
+        for frame in shared:
+            first = cam_from_board[place[0, frame]].inverse
+            own = cam_from_board[place[camera, frame]]
+            options.append((own @ first, own @ half_turn @ first))
+        for frame, turned in zip(shared, _agreeing(options), strict=True):
+            if turned:
+                index = place[camera, frame]
+                view = renumbered[index]
+                corner = board.symmetries[0][view.corner]
+                order = np.argsort(corner)
+                renumbered[index] = replace(
+                    view, corner=corner[order], pixels=view.pixels[order],
+                    sigma_px=view.sigma_px[order],
+                )  # fmt: skip
+                count += 1
+    return replace(views, views=tuple(renumbered)), count
+
+
+def _half_turn(board: Board) -> Transform:
+    """board_from_board that takes each corner to the one it may be mistaken for."""
+    middle = board.corners_m.mean(0)
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return Transform(turn, middle - turn @ middle)
+
+
+def _agreeing(options: Sequence[tuple[Transform, Transform]]) -> list[bool]:
+    """Which of two transforms to take of each, so that all are most alike in their rotation."""
+
+    def off(truth: Transform, option: tuple[Transform, Transform]) -> list[float]:
+        return [angle_between(truth.rotation, each.rotation) for each in option]
+
+    candidates = [each for option in options for each in option]
+    sums = [sum(min(off(truth, option)) for option in options) for truth in candidates]
+    best = candidates[int(np.argmin(sums))]
+    return [bool(np.argmin(off(best, option)) == 1) for option in options]
