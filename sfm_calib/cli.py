@@ -20,6 +20,7 @@ from pydantic import ValidationError
 import sfm_calib
 from sfm_calib.anchors import calibrate_with_board
 from sfm_calib.boards.load import load_board
+from sfm_calib.boards.page import write_board
 from sfm_calib.boards.spec import Board
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, calibrate
@@ -27,6 +28,7 @@ from sfm_calib.check import check_scan
 from sfm_calib.check_terminal import print_check
 from sfm_calib.colmap import quiet
 from sfm_calib.commands import (
+    BoardCommand,
     Calibrate,
     Check,
     Command,
@@ -65,6 +67,7 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
     commands: Any = (
         calibrate_type
         | Annotated[Target, tyro.conf.subcommand("target", default=target_default)]
+        | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
@@ -125,6 +128,8 @@ def run(command: Command, arguments: Sequence[str]) -> None:
         run_calibrate(command, arguments)
     elif isinstance(command, Target):
         run_target(command, arguments)
+    elif isinstance(command, BoardCommand):
+        run_board(command)
     elif isinstance(command, Compare):
         with output_folder(command.out) if command.out else nullcontext():
             run_compare(command)
@@ -176,6 +181,17 @@ def run_target(command: Target, arguments: Sequence[str]) -> None:
             )
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
         finish(outcome, command.out, rows, command.json)
+
+
+def run_board(command: BoardCommand) -> None:
+    """Write a board's page and its YAML."""
+    description = command.out.with_suffix(".yaml")
+    taken = [path for path in (command.out, description) if path.exists()]
+    if taken and not command.overwrite:
+        raise CalibrationError(f"{taken[0]} is there already: choose another name, or --overwrite")
+    with output_folder(command.out.parent):
+        page, description = write_board(command.options, command.out)
+    print(f"{page} and {description} written; print at 100 % and check the rulers")
 
 
 def told(arguments: Sequence[str]) -> str:

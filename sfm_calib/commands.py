@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.simulate.scan import SimulateOptions
@@ -124,4 +125,19 @@ class Demo:
     """Show COLMAP's own log."""
 
 
-Command = Calibrate | Target | Compare | Check | Simulate | SimulateTracks | Demo
+@dataclass(frozen=True)
+class BoardCommand:
+    """Print a board true to scale: FILE.pdf, with rulers to check it by, and FILE.yaml.
+
+    Give the YAML to `target --board` and `calibrate --board`. Measure the printed board, and
+    correct the YAML where it is off.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.pdf")]
+    """Where to write the page; the board's YAML goes beside it."""
+    options: Annotated[BoardPrint, tyro.conf.arg(name="")] = field(default_factory=BoardPrint)
+    overwrite: bool = False
+    """Replace files that are there."""
+
+
+Command = Calibrate | Target | Compare | BoardCommand | Check | Simulate | SimulateTracks | Demo

@@ -120,7 +120,7 @@ def _question(
         ],
         "lensmodel": LENS_MODELS[start.cameras[0].lens],
         "sizes": [list(size) for size in views.sizes],
-        "square": board.square_m,
+        "square": board.unit_m,
         "grid": image_pixels(views.sizes[0], GRID)[2].tolist(),
         "distance": NEAR_BOARDS * float(np.ptp(board.corners_m, axis=0).max()),
         "bends": options.bends,

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from graphs.frames import FloatArray, Transform, angle_between
-from sfm_calib.boards.spec import Board
+from sfm_calib.boards.spec import Board, Checkerboard
 from sfm_calib.boards.views import BoardView, BoardViews
 
 IMAGES = ("*.png", "*.jpg")
@@ -31,12 +31,12 @@ DATA_SETS = {
     "opencv_stereo": DataSet(
         "opencv_stereo",
         ("left", "right"),
-        Board(type="checkerboard", columns=9, rows=6, square_m=1.0),  # unit squares
+        Checkerboard(inner_corners=(9, 6), square_m=1.0),  # unit squares
     ),
     "corridor_stereo": DataSet(
         "corridor_stereo/boards",
         ("left", "right"),
-        Board(type="checkerboard", columns=8, rows=6, square_m=0.025),
+        Checkerboard(inner_corners=(8, 6), square_m=0.025),
     ),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,11 +31,16 @@ class FoundBoard:
     messages: tuple[str, ...] = ()
 
 
-def find_board(scan: Scan, board: Board, progress: Progress) -> FoundBoard:
+def find_board(
+    scan: Scan,
+    board: Board,
+    progress: Progress,
+    needed: Literal["every camera", "any", "none"] = "every camera",
+) -> FoundBoard:
     """Look for the board in every image of a scan.
 
-    Raises CalibrationError, with what the images seem to show instead, where a camera never sees
-    the board.
+    needed: what has to see it. Raises CalibrationError, with what the images seem to show instead,
+    where that never does.
     """
     found: list[Detection | None] = []
     with ThreadPoolExecutor(max_workers=2) as pool:
@@ -48,7 +54,8 @@ def find_board(scan: Scan, board: Board, progress: Progress) -> FoundBoard:
         for image, each in zip(scan.images, found, strict=True)
         if each is not None
     ]
-    _check_every_camera(scan, board, seen)
+    if needed == "every camera" or (needed == "any" and not seen):
+        _check_every_camera(scan, board, seen)
     failed = [image for image, each in zip(scan.images, found, strict=True) if each is None]
     messages = _messages(scan, board, failed)
     views = tuple(sorted(seen, key=lambda view: (view.frame, view.camera)))
