@@ -10,11 +10,11 @@ from graphs.board_shape import shape_sigmas
 from graphs.boards import shape_of
 from graphs.jackknife import change
 from graphs.problem import images_seen
-from sfm_calib import result
+from sfm_calib.board_record import BoardResult, Without
 from sfm_calib.run import Run
 
 
-def board_result(run: Run) -> result.BoardResult | None:
+def board_result(run: Run) -> BoardResult | None:
     """The record; None where no board was used."""
     use, problem, estimate = run.board, run.refinement.problem, run.refinement.estimate
     if use is None or problem.board is None:
@@ -28,7 +28,7 @@ def board_result(run: Run) -> result.BoardResult | None:
     )
     bends, of_bends = 1e3 * np.exp(shape[0]) * shape[1:], 1e3 * sigma[1:]
     held = problem.board.board.shape_sigma[1:] == 0
-    return result.BoardResult(
+    return BoardResult(
         description=use.board.described,
         n_images={name: images[index] for index, name in enumerate(names)},
         n_corners={name: int((corners.camera == index).sum()) for index, name in enumerate(names)},
@@ -47,7 +47,7 @@ def board_result(run: Run) -> result.BoardResult | None:
     )
 
 
-def _without(run: Run) -> dict[str, result.Without]:
+def _without(run: Run) -> dict[str, Without]:
     """What the scan alone says of each parameter, beside what the board moved."""
     alone = None if run.board is None else run.board.without
     if alone is None:
@@ -59,7 +59,7 @@ def _without(run: Run) -> dict[str, result.Without]:
     found = {}
     for name, sigma in alone.covariance.stated.sigma.items():
         comparable = metric or ".translation_" not in name
-        found[name] = result.Without(
+        found[name] = Without(
             sigma=sigma if comparable else None, moved=moved[name] if comparable else None
         )
     return found

@@ -24,7 +24,8 @@ from sfm_calib.findings import Finding, blurred_images, image_findings, solve_fi
 from sfm_calib.images import Progress, Scan, read_scan
 from sfm_calib.mapping import Mapped, map_scan
 from sfm_calib.nominal import check_config, known_cameras, lens_of, start_from_config
-from sfm_calib.result import Calibration, Record
+from sfm_calib.record import Record
+from sfm_calib.result import Calibration
 from sfm_calib.run import Run
 from sfm_calib.sharpness import ImageQuality, lit_cells, measure_images
 from sfm_calib.summary import summarise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Literal
 
-from sfm_calib.result import Record
+from sfm_calib.record import Record
 
 FORMAT: Final = "sfm_calib/compare/1"
 Kind = Literal["same", "agree", "differ", "cannot tell", "no sigmas"]

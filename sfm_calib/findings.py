@@ -12,7 +12,8 @@ import numpy as np
 
 from graphs.observability import USABLE_FOCAL_SIGMA
 from sfm_calib.images import Scan
-from sfm_calib.result import Calibration, CameraResult, Record
+from sfm_calib.record import Record
+from sfm_calib.result import Calibration, CameraResult
 from sfm_calib.sharpness import ImageQuality, dark_share
 
 Severity = Literal["note", "doubtful", "cannot"]

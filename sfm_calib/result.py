@@ -7,23 +7,19 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from graphs.camera import Camera
 from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
+from sfm_calib.board_record import BoardResult
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
+from sfm_calib.record import Record
 
 FORMAT: Final = "sfm_calib/1"
 OF_LENS: Final = "choice of the lens"  # the kind of what is no direction: of another lens
 PRIOR_DECIDES_SHARE = 0.5  # of what is known of a parameter: more is belief rather than data
-
-
-class Record(BaseModel):
-    """A part of the file: frozen, without unknown keys, without NaN."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CameraResult(Record):
@@ -32,8 +28,10 @@ class CameraResult(Record):
     lens: LensName
     size: tuple[int, int]  # width, height in px
     params: dict[str, float]  # OpenCV's names; pixel centres at integers
-    sigma: dict[str, float] = {}
-    prior_share: dict[str, float] = {}  # var_posterior / var_prior: 1 belief alone, 0 data alone
+    sigma: dict[str, float] = Field(default_factory=dict)
+    prior_share: dict[str, float] = Field(
+        default_factory=dict
+    )  # var_posterior / var_prior: 1 belief alone, 0 data alone
     n_images: int = 0
     n_observations: int = 0
 
@@ -137,8 +135,10 @@ class Noise(Record):
 
     sigma_px: float  # robust sigma of one pixel coordinate
     inflation: float = 1.0  # median of stated sigma / model sigma
-    by_size: dict[str, tuple[NoiseBySize, ...]] = {}  # of each camera
-    sigmas: dict[str, Sigmas] = {}  # of each parameter, by its name in the covariance
+    by_size: dict[str, tuple[NoiseBySize, ...]] = Field(default_factory=dict)  # of each camera
+    sigmas: dict[str, Sigmas] = Field(
+        default_factory=dict
+    )  # of each parameter, by its name in the covariance
 
 
 class ProjectionSigma(Record):
@@ -179,7 +179,7 @@ class Uncertainty(Record):
 
     unit: Literal["m", "baseline"] | None = None  # of ranges and depths; None: there is no unit
     sigma_px: float | None = None  # noise of one pixel coordinate in depths; None: no depths
-    projection: dict[str, tuple[ProjectionSigma, ...]] = {}
+    projection: dict[str, tuple[ProjectionSigma, ...]] = Field(default_factory=dict)
     depth: tuple[PairDepth, ...] = ()
 
 
@@ -302,42 +302,18 @@ class Solve(Record):
     n_observations: int
     n_rejected: int = 0  # mismatches, beyond the loss
     selection: Selection | None = None  # None: all observations were used
-    seconds: dict[str, float] = {}
-
-
-class Without(Record):
-    """A parameter as the scan alone has it, without the board."""
-
-    sigma: float | None  # stated, in the covariance's unit; None: without a metre, no length is
-    moved: float | None  # by the board, in that unit
-
-
-class BoardResult(Record):
-    """The calibration board that took part, and what became of it."""
-
-    description: str
-    n_images: dict[str, int]  # of each camera, in which it was seen and used
-    n_corners: dict[str, int]
-    sigma_px: dict[str, float]  # robust, of one coordinate of its corners
-    in_scan: Literal["", "still", "waved"] = ""  # where it was seen in the scan itself
-    size: float = 1.0  # estimated over stated lengths
-    sigma_size: float = 0.0
-    bend_mm: tuple[float, float] = (0.0, 0.0)  # of its middle, against left and right, top and foot
-    sigma_bend_mm: tuple[float, float] = (0.0, 0.0)  # 0: held flat
-    left_out: tuple[str, ...] = ()  # `camera/frame: reason`
-    repeated: tuple[str, ...] = ()  # groups of frames that show it in one place
-    without: dict[str, Without] = {}  # of each parameter: what the scan alone says of it
+    seconds: dict[str, float] = Field(default_factory=dict)
 
 
 class Provenance(Record):
     """What made the result: enough to make it again."""
 
     version: str
-    versions: dict[str, str] = {}
+    versions: dict[str, str] = Field(default_factory=dict)
     command: str = ""
-    config: dict[str, object] = {}
+    config: dict[str, object] = Field(default_factory=dict)
     seed: int = 0
-    input_hashes: dict[str, str] = {}
+    input_hashes: dict[str, str] = Field(default_factory=dict)
     pixel_convention: Literal["OpenCV: the centre of the top-left pixel is (0, 0)"] = (
         "OpenCV: the centre of the top-left pixel is (0, 0)"
     )

@@ -10,6 +10,7 @@ import plotly.graph_objects as go
 
 from graphs.frames import FloatArray
 from graphs.problem import Estimate, Problem, residuals_px
+from sfm_calib.board_record import BoardResult
 from sfm_calib.report.digits import short
 from sfm_calib.report.theme import (
     BLUE,
@@ -22,7 +23,7 @@ from sfm_calib.report.theme import (
     round_number,
     styled,
 )
-from sfm_calib.result import BoardResult, Calibration
+from sfm_calib.result import Calibration
 
 SEEN = {
     "": "in images of its own",
