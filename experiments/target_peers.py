@@ -29,6 +29,7 @@ from experiments.peers.ours import OurOptions
 from experiments.peers.sightings import (
     DATA_SETS,
     DataSet,
+    common,
     consistent,
     frames_of,
     of_camera,
@@ -100,8 +101,7 @@ def numbered(data: Path, data_set: DataSet, lens: LensName) -> tuple[BoardViews,
     """Views of the frames that all cameras see, numbered alike, and how many were turned."""
     views = sightings(data, data_set)
     corners, n_cameras = data_set.board.corners_m, len(data_set.cameras)
-    seen = [view.frame for view in views.views]
-    views = of_frames(views, [frame for frame in set(seen) if seen.count(frame) == n_cameras])
+    views = common(views)  # detected whole or not at all, however they are numbered
     alone = [calibrate_camera(of_camera(views, index), corners, lens) for index in range(n_cameras)]
     placed = [alone[view.camera].rig_from_board[view.frame] for view in views.views]
     return consistent(views, data_set.board, placed)

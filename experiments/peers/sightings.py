@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from graphs.frames import FloatArray, Transform, angle_between
+<<<<<<< HEAD
 from sfm_calib.boards.spec import Board, Checkerboard
+=======
+from graphs.problem import BoolArray, IntArray
+from graphs.selection import MIN_CORNERS
+from sfm_calib.boards.spec import Board
+>>>>>>> peers
 from sfm_calib.boards.views import BoardView, BoardViews
 
 IMAGES = ("*.png", "*.jpg")
@@ -99,6 +106,25 @@ def of_camera(views: BoardViews, camera: int) -> BoardViews:
     return BoardViews((views.cameras[camera],), (views.sizes[camera],), views.frames, kept)
 
 
+def common(views: BoardViews) -> BoardViews:
+    """Of each frame that all cameras see, the corners that all of them see."""
+    by_frame = {
+        frame: [view for view in views.views if view.frame == frame] for frame in frames_of(views)
+    }
+    kept = []
+    for seen in by_frame.values():
+        corner = reduce(np.intersect1d, [view.corner for view in seen])
+        if len(seen) == len(views.cameras) and len(corner) >= MIN_CORNERS:
+            kept += [_chosen(view, np.isin(view.corner, corner)) for view in seen]
+    return replace(views, views=tuple(kept))
+
+
+def _chosen(view: BoardView, rows: BoolArray | IntArray) -> BoardView:
+    return replace(
+        view, corner=view.corner[rows], pixels=view.pixels[rows], sigma_px=view.sigma_px[rows]
+    )
+
+
 def frames_of(views: BoardViews) -> list[int]:
     """Frames that have a view."""
     return sorted({view.frame for view in views.views})
@@ -130,11 +156,7 @@ def consistent(
                 index = place[camera, frame]
                 view = renumbered[index]
                 corner = board.symmetries[0][view.corner]
-                order = np.argsort(corner)
-                renumbered[index] = replace(
-                    view, corner=corner[order], pixels=view.pixels[order],
-                    sigma_px=view.sigma_px[order],
-                )  # fmt: skip
+                renumbered[index] = _chosen(replace(view, corner=corner), np.argsort(corner))
                 count += 1
     return replace(views, views=tuple(renumbered)), count
 
