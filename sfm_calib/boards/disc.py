@@ -52,7 +52,8 @@ def fit_discs(
     good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
     radius_px = np.abs(fits.parameters[:, 2] * fits.parameters[:, 4]) ** -0.5
-    return Discs(centres, fit.centre_sigmas(fits, windows, good), radius_px, good)
+    sigma_px = fit.centre_sigmas(fits, windows, good)
+    return Discs(centres, sigma_px, radius_px, good & (sigma_px < fit.MOST_SIGMA_PX))
 
 
 def _model(parameters: fit.Values, offsets: fit.Values) -> tuple[fit.Values, fit.Values]:

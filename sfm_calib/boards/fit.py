@@ -25,6 +25,7 @@ FEWEST_SPARE = 4  # pixels beyond the number of parameters
 # is far noisier than the others, as where a finger covers a part.
 MOST_LEFT = 0.4
 ODD_NOISE, ODD_SHARE = 6.0, 0.03
+MOST_SIGMA_PX = 1.0  # a centre that is known less well is not found
 STILL_PX = 1e-3  # a step that moves no centre farther is the last
 PIXEL_PX = 0.3  # sigma of the blur by a pixel's own area, 1 / sqrt(12): no edge is sharper
 LAGS = 2  # px within which a sensor's or a codec's noise is taken to be correlated

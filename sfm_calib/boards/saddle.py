@@ -50,7 +50,8 @@ def fit_saddles(image: GrayImage, pixels: FloatArray, maps: FloatArray, clear: f
     good = found & (np.abs(contrast) > LEAST_CONTRAST)
     good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
-    return Saddles(centres, fit.centre_sigmas(fits, windows, good), contrast, good)
+    sigma_px = fit.centre_sigmas(fits, windows, good)
+    return Saddles(centres, sigma_px, contrast, good & (sigma_px < fit.MOST_SIGMA_PX))
 
 
 def _model(parameters: fit.Values, offsets: fit.Values) -> tuple[fit.Values, fit.Values]:
