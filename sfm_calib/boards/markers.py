@@ -30,7 +30,7 @@ CLEAR = 0.9
 MOST_MISFIT = 0.25
 GROWTH = 4  # rounds in which corners beside known ones are looked for
 REACH, PREDICTORS = 1.6, 4  # how far beside them, in sides of a square or tag; and from how many
-# Contrast beside the board's typical corner, at least (and at most its inverse): an occluder's edges
+# Contrast beside the board's typical corner, at least (and at most its inverse): edges of occluders
 # are otherwise. Corners that no marker speaks for must be more alike: with the first limit alone 13
 # come into 48 video frames with a hand on the board, some 4 px off; with these 7, all of them good.
 LEAST_CONTRAST, GROWN_CONTRAST, GROWN_SIGMA = 0.35, 0.6, 3.0
