@@ -70,7 +70,7 @@ def outcomes(
 
 def chosen(boards: Path, board: Board, cache: Cache, count: int) -> set[str]:
     """Names of the frames, so many, in which the board lies most differently."""
-    scan = read_target(boards, cache, "stem", count, None, _unsaid)
+    scan = read_target(boards, cache, "stem", count, None, _unsaid, least=1)
     views = find_board(scan, board, _unsaid).views
     kept = thin(views.views, count, board.corners_m, views.sizes)
     return {views.frames[views.views[index].frame] for index in kept}

@@ -36,6 +36,7 @@ def read_target(
     video_frames: int,
     tolerance_s: float | None,
     progress: Progress,
+    least: int = MIN_IMAGES,
 ) -> Scan:
     """Find and check the images of a board; videos are unpacked into the cache.
 
@@ -43,7 +44,7 @@ def read_target(
     by order, or by time (their stems are times, matched to the nearest within `tolerance_s`;
     default: a third of their spacing). Videos are matched by the times beside them, if any, unless
     by order, and else by frame number; at most three times `video_frames` moments are taken.
-    What was done is told in the scan's warnings.
+    What was done is told in the scan's warnings. least: images in all.
     Raises CalibrationError when there are no images, or they cannot be one calibration's.
     """
     if not folder.exists():
@@ -55,11 +56,11 @@ def read_target(
         scan = _from_images(folder, files, matching, tolerance_s, progress)
     else:
         scan = _from_videos(folder, cache, matching, video_frames, tolerance_s, progress)
-    if len(scan.images) < MIN_IMAGES:
+    if len(scan.images) < least:
         raise CalibrationError(
             f"{folder} holds {len(scan.images)} usable image{'s' * (len(scan.images) != 1)}"
             f"{''.join(f'; {warning}' for warning in scan.warnings)}; a calibration needs at least "
-            f"{MIN_IMAGES}: take more, with the board at other angles"
+            f"{least}: take more, with the board at other angles"
         )
     return replace(scan, warnings=scan.warnings + _cameras_alone(scan))
 
