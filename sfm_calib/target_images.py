@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -173,16 +172,15 @@ def _from_videos(
 
 
 def _cameras_alone(scan: Scan) -> tuple[str, ...]:
-    """A warning of every camera that never takes an image together with another."""
-    frames: Mapping[int, set[int]] = defaultdict(set)
+    """A warning of the cameras that never take an image together with another."""
+    cameras = defaultdict(set)
     for image in scan.images:
-        frames[image.camera].add(image.frame)
-    warnings = []
-    for camera, name in enumerate(scan.cameras):
-        others = set().union(*(own for number, own in frames.items() if number != camera))
-        if others and not frames[camera] & others:
-            warnings.append(
-                f"camera {name} shares no frame with another camera: its lens can be calibrated "
-                "and its place in the rig cannot; are its images named, or timed, as the others'?"
-            )
-    return tuple(warnings)
+        cameras[image.frame].add(image.camera)
+    together = {camera for own in cameras.values() if len(own) > 1 for camera in own}
+    alone = [name for camera, name in enumerate(scan.cameras) if camera not in together]
+    if not alone or len(scan.cameras) == 1:
+        return ()
+    return (
+        f"no frame shared with another camera by {', '.join(alone)}: the lens can be calibrated, "
+        "the place in the rig cannot; are images that were taken together matched rightly?",
+    )
