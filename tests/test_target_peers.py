@@ -30,7 +30,7 @@ from experiments.peers.sightings import (
 from experiments.target_peers import PeersOptions
 from graphs.boards import corners_of
 from graphs.problem import Problem
-from sfm_calib.boards.spec import Board
+from sfm_calib.boards.spec import Checkerboard
 from sfm_calib.boards.views import BoardView, BoardViews
 
 NOISE_PX = 0.1
