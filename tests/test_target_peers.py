@@ -34,7 +34,7 @@ from sfm_calib.boards.spec import Checkerboard
 from sfm_calib.boards.views import BoardView, BoardViews
 
 NOISE_PX = 0.1
-BOARD = Board(type="checkerboard", columns=COLUMNS, rows=ROWS, square_m=SQUARE_M)
+BOARD = Checkerboard(inner_corners=(COLUMNS, ROWS), square_m=SQUARE_M)
 CORNERS = BOARD.corners_m
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -224,14 +224,14 @@ def test_a_bend_and_rolling_rows_are_told_apart(views: BoardViews) -> None:
 
 @pytest.mark.parametrize("columns", [COLUMNS, 7])
 def test_half_turns_between_cameras_are_undone(columns: int) -> None:
-    board = Board(type="checkerboard", columns=COLUMNS, rows=ROWS, square_m=SQUARE_M)
+    board = Checkerboard(inner_corners=(COLUMNS, ROWS), square_m=SQUARE_M)
     seen, truth = scene(8)
     whole = {}
     for view in seen.views:
         whole.setdefault(view.frame, []).append(len(view.corner) == len(CORNERS))
     seen = of_frames(seen, [frame for frame, full in whole.items() if all(full)])
     if columns != COLUMNS:  # an odd sum of corners looks like itself one way round only
-        asked = replace_columns(board, columns)
+        asked = Checkerboard(inner_corners=(columns, ROWS), square_m=SQUARE_M)
         placed = [truth.rig_from_board[view.frame] for view in seen.views]
         assert consistent(seen, asked, placed) == (seen, 0)
         return
@@ -247,10 +247,6 @@ def test_half_turns_between_cameras_are_undone(columns: int) -> None:
     for view, wanted in zip(mended.views, seen.views, strict=True):
         np.testing.assert_array_equal(view.corner, wanted.corner)
         np.testing.assert_array_equal(view.pixels, wanted.pixels)
-
-
-def replace_columns(board: Board, columns: int) -> Board:
-    return Board(**{**board.model_dump(), "columns": columns})
 
 
 def test_corners_of_a_drawn_board_are_found() -> None:
