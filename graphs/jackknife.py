@@ -71,6 +71,15 @@ def blocks_of(problem: Problem, most: int = BLOCKS) -> IntArray:
     return block
 
 
+def second_half(problem: Problem) -> NDArray[np.bool_]:
+    """Frames (n_frames,) of every second block; of a board beside a scan, every second one."""
+    second: NDArray[np.bool_] = blocks_of(problem) % 2 == 1
+    of_board = problem.board_frames
+    if of_board.any() and not of_board.all():
+        second[of_board] = np.arange(of_board.sum()) % 2 == 1
+    return second
+
+
 def delete_group_jackknife(
     graph: CalibrationGraph,
     estimate: Estimate,
@@ -125,6 +134,8 @@ def solve_part(
         rest = select_tracks(
             replace(problem, initial=estimate, observations=seen.subset(keep)), min_parallax_deg
         )
+        if rest.metric != problem.metric:  # without what gives metres: another unit
+            return None
         part = build(rest, graph.options)
         found, values, summary = solve(part, STEPS, TOLERANCE, near=True)
         if not summary.converged:
