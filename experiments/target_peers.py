@@ -38,12 +38,12 @@ from experiments.peers.sightings import (
     sightings,
 )
 from graphs.lenses import LensName
+from graphs.priors import TANGENTIAL_SIGMA_WITH_BOARD
 from sfm_calib.boards.spec import Board
 from sfm_calib.boards.views import BoardViews
+from sfm_calib.target import BEND_SIGMA
 
 REFERENCE = "OpenCV, refined"
-# Beliefs for boards: bends of up to 2 % of half the board; lenses' p1, p2 reach 0.004.
-BEND_SIGMA, TANGENTIAL_SIGMA = 0.02, 0.01
 TABLE_WIDTH = 160
 
 
@@ -126,14 +126,17 @@ def programs_of(board: Board, lens: LensName) -> tuple[dict[str, Calibrate], str
         return mrcal.calibrate(views, board, calibrate_pair(views, corners, lens, True), options)
 
     alike = OurOptions(like_opencv=True)
-    usual = OurOptions(tangential_sigma=TANGENTIAL_SIGMA)
+    usual = OurOptions(
+        tangential_sigma=TANGENTIAL_SIGMA_WITH_BOARD,
+        bend_sigma=2 * BEND_SIGMA,
+        corner_sigma_m=board.misprint_m,
+    )
     programs: dict[str, Calibrate] = {
         "OpenCV": lambda views: calibrate_pair(views, corners, lens, refined=False),
         REFERENCE: lambda views: calibrate_pair(views, corners, lens, refined=True),
         "ours, alike": partial(by_us, alike),
-        "ours, alike, bent": partial(by_us, replace(alike, bend_sigma=BEND_SIGMA)),
+        "ours, printed exactly": partial(by_us, replace(usual, corner_sigma_m=0.0)),
         "ours": partial(by_us, usual),
-        "ours, bent": partial(by_us, replace(usual, bend_sigma=BEND_SIGMA)),
     }
     why_not = "it has no such lens" if lens not in mrcal.LENS_MODELS else mrcal.why_not()
     if why_not is None:

@@ -19,7 +19,7 @@ from graphs.system import assemble, jacobian_of
 def shape_sigmas(
     graph: CalibrationGraph, estimate: Estimate, values: gtsam.Values, inflation: float = 1.0
 ) -> FloatArray:
-    """Sigmas (3,) of a board's shape as `graphs.boards.corners_of` has it.
+    """Sigmas (k,) of a board's shape as `graphs.boards.corners_of` has it.
 
     inflation: of what the noise of the data brings, over what independent noise would.
     """

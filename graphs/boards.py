@@ -17,7 +17,8 @@ from graphs.frames import NOT_SMART, FloatArray, skew, to_gtsam_inverse
 from graphs.keys import board_key, shape_key
 from graphs.problem import Board, Estimate, Problem
 
-N_SHAPE, N_PLACE = 3, 6
+N_WHOLE = 3  # of a board's shape, what concerns it as a whole: size and bends
+N_PLACE = 6
 LEAST_SIGMA = 1e-9  # of a shape that is held: relative, and in units of the board
 
 
@@ -30,22 +31,32 @@ class Corners:
 
 
 def corners_of(board: Board, shape: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners (n, 3) in the board's frame, and derivatives (n, 3, 3) by its shape.
+    """Corners (n, 3) in the board's frame, and derivatives (n, 3, k) by its shape.
 
-    shape (3,): logarithm of the size over the stated one; by how much the middle stands out
-    against the edges left and right, and above and below (mrcal's two-parameter bend).
+    shape (k,): logarithm of the size over the stated one; by how much the middle stands out
+    against the edges left and right, and above and below (mrcal's two-parameter bend); then,
+    unless they are where they are stated to be, how far off each corner is in x, y, z.
     """
     middle = (board.corners.max(0) + board.corners.min(0)) / 2
     half = (board.corners.max(0) - board.corners.min(0)) / 2
     off = (board.corners - middle)[:, :2] / np.maximum(half[:2], 1e-300)
     arch = 1 - off**2  # (n, 2)
     bent = board.corners.copy()
-    bent[:, 2] += arch @ shape[1:]
-    size = float(np.exp(shape[0]))
-    by_shape = np.zeros((len(bent), 3, N_SHAPE))
+    bent[:, 2] += arch @ shape[1:N_WHOLE]
+    size, n = float(np.exp(shape[0])), len(bent)
+    by_shape = np.zeros((n, 3, len(shape)))
+    if len(shape) > N_WHOLE:
+        bent += shape[N_WHOLE:].reshape(n, 3)
+        own = N_WHOLE + np.arange(3 * n).reshape(n, 3)
+        by_shape[np.arange(n)[:, None], np.arange(3), own] = size
     by_shape[:, :, 0] = size * bent
-    by_shape[:, 2, 1:] = size * arch
+    by_shape[:, 2, 1:N_WHOLE] = size * arch
     return size * bent, by_shape
+
+
+def shape_length(board: Board) -> int:
+    """Variables of a board's shape."""
+    return len(board.shape_mean)
 
 
 def place_corners(board: Board, values: gtsam.Values) -> Corners:
@@ -75,7 +86,10 @@ def board_keys(problem: Problem) -> list[int]:
 
 def board_width(problem: Problem) -> int:
     """Columns of the board's variables."""
-    return sum(N_PLACE if key == board_key() else N_SHAPE for key in board_keys(problem))
+    if problem.board is None:
+        return 0
+    of_shape = shape_length(problem.board.board)
+    return sum(N_PLACE if key == board_key() else of_shape for key in board_keys(problem))
 
 
 def insert_board(values: gtsam.Values, problem: Problem) -> None:
@@ -89,7 +103,7 @@ def insert_board(values: gtsam.Values, problem: Problem) -> None:
 
 
 def shape_of(estimate: Estimate, board: Board) -> FloatArray:
-    """The board's shape (3,), as stated where nothing was estimated."""
+    """The board's shape (k,), as stated where nothing was estimated."""
     return board.shape_mean if estimate.board_shape is None else estimate.board_shape
 
 

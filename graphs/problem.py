@@ -76,7 +76,7 @@ class Estimate:
     rig_from_world: tuple[Transform, ...]  # one a frame
     points: FloatArray  # (n_points, 3) in the world
     world_from_board: Transform | None = None  # of the board that stays put; None: there is none
-    board_shape: FloatArray | None = None  # (3,) as `graphs.boards.corners_of` takes it
+    board_shape: FloatArray | None = None  # (k,) as `graphs.boards.corners_of` takes it
 
     def scaled(self, factor: float) -> Estimate:
         """The same scene in units `factor` times smaller."""
@@ -88,7 +88,7 @@ class Estimate:
             world_from_board=self.world_from_board and self.world_from_board.scaled(factor),
             board_shape=None
             if self.board_shape is None
-            else self.board_shape + np.array([np.log(factor), 0.0, 0.0]),
+            else np.concatenate([[self.board_shape[0] + np.log(factor)], self.board_shape[1:]]),
         )
 
 
@@ -128,8 +128,8 @@ class Board:
     """A flat target: its corners as stated, and what is known of its size and flatness."""
 
     corners: FloatArray  # (n, 3) in the board's frame, in m
-    shape_mean: FloatArray  # (3,) as `graphs.boards.corners_of` takes it
-    shape_sigma: FloatArray  # (3,) relative, and of the bends in m; 0: held
+    shape_mean: FloatArray  # (k,) as `graphs.boards.corners_of` takes it
+    shape_sigma: FloatArray  # (k,) relative of the size, else in m; 0: held
 
 
 @dataclass(frozen=True)

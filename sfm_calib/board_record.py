@@ -28,6 +28,7 @@ class BoardResult(Record):
     sigma_size: float = 0.0
     bend_mm: tuple[float, float] = (0.0, 0.0)  # of its middle, against left and right, top and foot
     sigma_bend_mm: tuple[float, float] = (0.0, 0.0)  # 0: held flat
+    corners_off_mm: float = 0.0  # rms, from where they are stated to be; 0: held
     left_out: tuple[str, ...] = ()  # `camera/frame: reason`
     repeated: tuple[str, ...] = ()  # groups of frames that show it in one place
     without: dict[str, Without] = Field(

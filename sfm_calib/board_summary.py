@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from graphs.board_shape import shape_sigmas
-from graphs.boards import shape_of
+from graphs.boards import N_WHOLE, shape_of
 from graphs.jackknife import change
 from graphs.problem import images_seen
 from sfm_calib.board_record import BoardResult, Without
@@ -26,8 +26,9 @@ def board_result(run: Run) -> BoardResult | None:
     sigma = shape_sigmas(
         run.refinement.graph, estimate, run.refinement.values, run.covariance.inflation
     )
-    bends, of_bends = 1e3 * np.exp(shape[0]) * shape[1:], 1e3 * sigma[1:]
-    held = problem.board.board.shape_sigma[1:] == 0
+    bends, of_bends = 1e3 * np.exp(shape[0]) * shape[1:N_WHOLE], 1e3 * sigma[1:N_WHOLE]
+    held = problem.board.board.shape_sigma[1:N_WHOLE] == 0
+    off = shape[N_WHOLE:].reshape(-1, 3)
     return BoardResult(
         description=use.board.described,
         n_images={name: images[index] for index, name in enumerate(names)},
@@ -41,6 +42,7 @@ def board_result(run: Run) -> BoardResult | None:
             0.0 if held[0] else float(of_bends[0]),
             0.0 if held[1] else float(of_bends[1]),
         ),
+        corners_off_mm=1e3 * float(np.sqrt((off**2).sum(1).mean())) if len(off) else 0.0,
         left_out=use.left_out,
         repeated=use.repeated,
         without=_without(run),

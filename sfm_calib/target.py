@@ -76,11 +76,14 @@ def calibrate_target(
 
 
 def graph_board(board: spec.Board) -> Board:
-    """The board as the graph takes it: its corners, and what is known of its size and flatness."""
+    """The board as the graph takes it: its corners, and how well their places are known."""
     corners = board.corners_m
     length = float(np.ptp(corners[:, :2], axis=0).max())
     bend = BEND_SIGMA * length if board.warp else 0.0
-    return Board(corners, np.zeros(3), np.array([board.relative_sigma, bend, bend]))
+    sigma = np.array([board.relative_sigma, bend, bend])
+    if board.misprint_m > 0:
+        sigma = np.concatenate([sigma, np.full(corners.size, board.misprint_m)])
+    return Board(corners, np.zeros(len(sigma)), sigma)
 
 
 def diverse(started: BoardStart, views: BoardViews, board: spec.Board, most: int) -> BoardStart:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphs.boards import N_SHAPE, corners_of
+from graphs.boards import N_WHOLE, corners_of
 from graphs.camera import Camera, project, project_jacobian
 from graphs.covariance import POSE_NAMES, Covariance
 from graphs.frames import FloatArray, Transform, log_rotation, skew
@@ -53,7 +53,7 @@ class PeerCalibration:
 
 def flat(corners: FloatArray) -> Board:
     """A board of corners (n, 3) that is as flat and as large as stated."""
-    return Board(corners, np.zeros(N_SHAPE), np.zeros(N_SHAPE))
+    return Board(corners, np.zeros(N_WHOLE), np.zeros(N_WHOLE))
 
 
 def residuals_of(

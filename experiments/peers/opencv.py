@@ -17,7 +17,7 @@ from experiments.peers.calibrations import (
     rms,
 )
 from experiments.peers.sightings import common, of_camera
-from graphs.boards import N_SHAPE
+from graphs.boards import N_WHOLE
 from graphs.camera import Camera
 from graphs.covariance import POSE_NAMES, Covariance
 from graphs.frames import FloatArray, Transform, exp_rotation
@@ -60,7 +60,7 @@ def calibrate_camera(views: BoardViews, corners: FloatArray, lens: LensName) -> 
     covariance = Covariance(tuple(f"{name}.{each}" for each in names), stated)
     return _finished(
         PeerCalibration(
-            "OpenCV", (camera,), (Transform.identity(),), placed, np.zeros(N_SHAPE), covariance,
+            "OpenCV", (camera,), (Transform.identity(),), placed, np.zeros(N_WHOLE), covariance,
             0.0, seconds=time.perf_counter() - begin,
         ),
         views, corners,
@@ -99,7 +99,7 @@ def calibrate_pair(
     }
     pair = PeerCalibration(
         "OpenCV, refined" if refined else "OpenCV", cameras,
-        (Transform.identity(), Transform(R, t.ravel())), placed, np.zeros(N_SHAPE),
+        (Transform.identity(), Transform(R, t.ravel())), placed, np.zeros(N_WHOLE),
         Covariance((), np.zeros((0, 0))), 0.0, seconds=time.perf_counter() - begin,
     )  # fmt: skip
     pair = _finished(pair, both, corners)

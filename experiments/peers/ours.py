@@ -44,6 +44,7 @@ class OurOptions:
 
     like_opencv: bool = False  # least squares of all corners, no priors, the size as stated
     bend_sigma: float = 0.0  # of the board's bends, of half its longer side; 0: flat
+    corner_sigma_m: float = 0.0  # of where its corners lie; 0: as stated
     size_sigma: float = 0.0  # of the board's size, relative
     loss: LossName = "cauchy"  # where not like OpenCV
     tangential_sigma: float | None = None  # of the prior on p1 and p2; None: as for scans
@@ -138,7 +139,10 @@ def problem_of(
     n, n_frames = len(corners), len(frames)
     half = float(np.ptp(corners, axis=0).max()) / 2
     bends = options.bend_sigma * half
-    board = Board(corners, np.zeros(3), np.array([options.size_sigma, bends, bends]))
+    sigma = np.array([options.size_sigma, bends, bends])
+    if options.corner_sigma_m > 0:
+        sigma = np.concatenate([sigma, np.full(corners.size, options.corner_sigma_m)])
+    board = Board(corners, np.zeros(len(sigma)), sigma)
     observations = Observations(
         np.concatenate([view.pixels for view in views.views]),
         np.concatenate([np.full(len(view.corner), place[view.frame]) for view in views.views]),
@@ -148,7 +152,7 @@ def problem_of(
     rig_from_board = tuple(_placed(views, corners, start, frame) for frame in frames)
     estimate = Estimate(
         start.cameras, start.cam_from_rig, rig_from_board, np.tile(corners, (n_frames, 1)), None,
-        np.zeros(3),
+        board.shape_mean,
     )  # fmt: skip
     of_board = BoardPoints(
         board, np.tile(np.arange(n), n_frames), np.zeros(n * n_frames, dtype=bool)

@@ -18,6 +18,9 @@ from graphs.problem import IntArray
 BoardType = Literal["checkerboard", "charuco", "aprilgrid", "circles"]
 # Of a length on the board: office printers are off by 0.1 to 0.5 %, good boards by less.
 DEFAULT_RELATIVE_SIGMA = 0.001
+# Of a square: corners of two real boards predict views held out best when they are believed to be
+# where they belong to within 1 to 3 thousandths of it.
+DEFAULT_MISPRINT = 0.002
 MOST = 100  # of anything along one side of a board
 TAG36H11_IDS = 587  # tags in the family
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
@@ -38,6 +41,8 @@ class Board(BaseModel):
     type: BoardType
     square_sigma_m: Length | None = None  # of that length, as an error of the whole board's scale
     warp: bool = True  # whether the board may be bent a little
+    # How far single corners may lie from where they belong, in every direction; 0: not at all.
+    corner_sigma_m: float | None = Field(default=None, ge=0, le=1)
 
     @property
     def unit_m(self) -> float:
@@ -50,6 +55,13 @@ class Board(BaseModel):
         if self.square_sigma_m is None:
             return DEFAULT_RELATIVE_SIGMA
         return self.square_sigma_m / self.unit_m
+
+    @property
+    def misprint_m(self) -> float:
+        """Sigma of where single corners lie."""
+        if self.corner_sigma_m is None:
+            return DEFAULT_MISPRINT * self.unit_m
+        return self.corner_sigma_m
 
     @property
     def corners_m(self) -> FloatArray:

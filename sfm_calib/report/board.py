@@ -113,6 +113,10 @@ def board_lines(board: BoardResult) -> list[str]:
         lines.append(f"the board is {' and '.join(said)}")
     elif max(board.sigma_bend_mm) > 0:
         lines.append(f"the board is flat to {short(max(board.sigma_bend_mm))} mm")
+    if board.corners_off_mm > 0:
+        lines.append(
+            f"its corners lie {short(board.corners_off_mm)} mm (rms) from where they belong"
+        )
     return lines
 
 

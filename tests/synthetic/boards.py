@@ -87,3 +87,11 @@ def _before_the_rig(rng: np.random.Generator, middle: FloatArray) -> Transform:
     turn = Transform.exp(rng.uniform(-0.7, 0.7, 3) * [1, 1, 2], np.zeros(3)).rotation
     place = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.08, 0.08), rng.uniform(0.35, 0.7)])
     return Transform(turn, place - turn @ middle)
+
+
+def misprinted(rng: np.random.Generator, sigma_m: float) -> tuple[Board, FloatArray]:
+    """A board whose corners are off by `sigma_m`, and its true shape."""
+    flat = flat_board()
+    sigma = np.concatenate([flat.shape_sigma, np.full(flat.corners.size, sigma_m)])
+    board = Board(flat.corners, np.zeros(len(sigma)), sigma)
+    return board, sigma * rng.standard_normal(len(sigma))
