@@ -48,7 +48,7 @@ class PeerCalibration:
                 f"{camera.name}.{name}": float(number)
                 for name, number in zip(POSE_NAMES, numbers, strict=True)
             }
-        return found | dict(zip(SHAPE_NAMES, self.shape.tolist(), strict=True))
+        return found | dict(zip(SHAPE_NAMES, self.shape[: len(SHAPE_NAMES)].tolist(), strict=True))
 
 
 def flat(corners: FloatArray) -> Board:
