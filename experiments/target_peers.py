@@ -29,6 +29,8 @@ from experiments.peers.ours import OurOptions
 from experiments.peers.sightings import (
     DATA_SETS,
     DataSet,
+    Detector,
+    common,
     consistent,
     frames_of,
     of_camera,
@@ -55,6 +57,8 @@ class PeersOptions:
     """The folder that has them."""
     lens: LensName = "brown"
     """Lens of every camera."""
+    detector: Detector = "ours"
+    """Whose corners all of them get."""
     folds: int = 0
     """Folds of the frames to leave out; 0: one frame at a time."""
     random_halves: int = 6
@@ -79,7 +83,7 @@ def main(options: PeersOptions) -> dict[str, dict[str, Row]]:
     console = Console(width=TABLE_WIDTH)
     rows: dict[str, dict[str, Row]] = {}
     for name in options.names:
-        views, n_turned = numbered(options.data, DATA_SETS[name], options.lens)
+        views, n_turned = numbered(options.data, DATA_SETS[name], options.lens, options.detector)
         board = DATA_SETS[name].board
         n_frames = len(frames_of(views))
         console.rule(f"{name}: {n_frames} frames, {len(views.views)} images, {n_turned} turned")
@@ -96,12 +100,13 @@ def main(options: PeersOptions) -> dict[str, dict[str, Row]]:
     return rows
 
 
-def numbered(data: Path, data_set: DataSet, lens: LensName) -> tuple[BoardViews, int]:
+def numbered(
+    data: Path, data_set: DataSet, lens: LensName, detector: Detector = "ours"
+) -> tuple[BoardViews, int]:
     """Views of the frames that all cameras see, numbered alike, and how many were turned."""
-    views = sightings(data, data_set)
+    views = sightings(data, data_set, detector)
     corners, n_cameras = data_set.board.corners_m, len(data_set.cameras)
-    seen = [view.frame for view in views.views]
-    views = of_frames(views, [frame for frame in set(seen) if seen.count(frame) == n_cameras])
+    views = common(views)  # detected whole or not at all, however they are numbered
     alone = [calibrate_camera(of_camera(views, index), corners, lens) for index in range(n_cameras)]
     placed = [alone[view.camera].rig_from_board[view.frame] for view in views.views]
     return consistent(views, data_set.board, placed)

@@ -21,6 +21,10 @@ from graphs.problem import (
     joined,
 )
 
+# Of the residuals of corners what the sigmas of their detection do not explain: 0.05 to 0.1 px on
+# five real sets, 0.16 px on a sixth.
+UNTOLD_PX = 0.07
+
 
 @dataclass(frozen=True)
 class SeenCorners:
@@ -68,8 +72,12 @@ def board_problem(
 
 
 def observed(seen: SeenCorners, point: IntArray) -> Observations:
-    """Corners as observations of points (n,), weighed among each other as detection has it."""
-    relative = seen.sigma_px / np.median(seen.sigma_px) if len(seen.sigma_px) else seen.sigma_px
+    """Corners as observations of points (n,), weighed among each other as detection has it.
+
+    What their sigmas do not tell, such as where paint ran, all corners share alike.
+    """
+    sigma_px = np.hypot(seen.sigma_px, UNTOLD_PX)
+    relative = sigma_px / np.median(sigma_px) if len(sigma_px) else sigma_px
     return Observations(seen.pixels, seen.frame, seen.camera, point, relative)
 
 

@@ -29,6 +29,9 @@ DISTORTION_SIGMA = {
     **dict.fromkeys(("p1", "p2", "s1", "s2", "s3", "s4"), 1e-3),
     **dict.fromkeys(("alpha", "beta", "xi"), 0.5),
 }
+# Where a board is seen, which tells p1, p2 from the principal point: they need no such hold, and
+# webcams have p2 = 0.0036.
+TANGENTIAL_SIGMA_WITH_BOARD = 1e-2
 PINNED_SIGMA = 1e-9  # a parameter that is held fixed
 
 
@@ -72,15 +75,22 @@ def weak_lens_prior(
     camera: Camera,
     principal_point_sigma: float = PRINCIPAL_POINT_SIGMA,
     aspect_sigma: float = ASPECT_SIGMA,
+    with_board: bool = False,
 ) -> LensPrior:
-    """What is believed of any lens before its first image, centred on an ideal one."""
+    """What is believed of any lens before its first image, centred on an ideal one.
+
+    with_board: a board is seen, which is enough to know p1, p2.
+    """
+    distortion = dict(DISTORTION_SIGMA)
+    if with_board:
+        distortion |= dict.fromkeys(("p1", "p2"), TANGENTIAL_SIGMA_WITH_BOARD)
     width, focal = camera.size[0], float(camera.params[:2].mean())
     mean = nominal_params(camera.lens, camera.size, focal)
     mean[:2] = focal
     sigma = np.array(
         [FOCAL_SIGMA * focal] * 2
         + [principal_point_sigma * width] * 2
-        + [DISTORTION_SIGMA[name] for name in camera.names[4:]]
+        + [distortion[name] for name in camera.names[4:]]
     )
     return LensPrior(mean, sigma, aspect_sigma)
 

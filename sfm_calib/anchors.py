@@ -90,7 +90,9 @@ def views_of_board(
     if board_images is None:
         found = find_board(scan, board, progress, "any")
         return SeenBoards(found.views, None, found.messages)
-    others = read_target(board_images, cache, config.frames, config.video_frames, None, progress)
+    others = read_target(
+        board_images, cache, config.frames, config.video_frames, None, progress, least=1
+    )
     check_same_cameras(scan, others)
     apart = find_board(others, board, progress, "any")
     in_scan = find_board(scan, board, progress, "none")

@@ -167,12 +167,16 @@ def with_params(camera: Camera, given: dict[str, float]) -> Camera:
     return replace(camera, params=np.array(params))
 
 
-def lens_priors(start: Estimate, config: RigConfig) -> tuple[LensPrior, ...]:
+def lens_priors(
+    start: Estimate, config: RigConfig, with_board: bool = False
+) -> tuple[LensPrior, ...]:
     """The weak prior of each lens, with what rig.yaml states in its place."""
     priors = []
     for camera in start.cameras:
         said = camera_config(config, camera.name)
-        weak = weak_lens_prior(camera, config.principal_point_sigma, config.aspect_sigma)
+        weak = weak_lens_prior(
+            camera, config.principal_point_sigma, config.aspect_sigma, with_board
+        )
         priors.append(stated_lens_prior(camera, weak, said.params, said.sigma, said.fixed))
     return tuple(priors)
 

@@ -30,9 +30,10 @@ from sfm_calib.nominal import check_config, known_cameras, lens_of, on_ladder, s
 from sfm_calib.run import Given
 from sfm_calib.target_images import read_target
 
-# Of the board's longer side, how far its middle may stand out: paper on cardboard bows by a few
-# thousandths, mrcal's boards of a metre by one or two mm.
-BEND_SIGMA = 0.005
+# Of the board's longer side, how far its middle may stand out: two boards of real sets do by 1.3 to
+# 2.4 thousandths, mrcal's of a metre by one or two mm. Held-out errors of those sets are smallest
+# with 1.5e-4 to 5e-4, and by 0.5 % larger with 1e-2.
+BEND_SIGMA = 0.001
 MIN_VIEWS = 3  # of a camera: each gives two numbers on its lens beyond the board's place
 
 

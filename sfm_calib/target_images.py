@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -36,6 +35,7 @@ def read_target(
     video_frames: int,
     tolerance_s: float | None,
     progress: Progress,
+    least: int = MIN_IMAGES,
 ) -> Scan:
     """Find and check the images of a board; videos are unpacked into the cache.
 
@@ -43,7 +43,7 @@ def read_target(
     by order, or by time (their stems are times, matched to the nearest within `tolerance_s`;
     default: a third of their spacing). Videos are matched by the times beside them, if any, unless
     by order, and else by frame number; at most three times `video_frames` moments are taken.
-    What was done is told in the scan's warnings.
+    What was done is told in the scan's warnings. least: images in all.
     Raises CalibrationError when there are no images, or they cannot be one calibration's.
     """
     if not folder.exists():
@@ -55,11 +55,11 @@ def read_target(
         scan = _from_images(folder, files, matching, tolerance_s, progress)
     else:
         scan = _from_videos(folder, cache, matching, video_frames, tolerance_s, progress)
-    if len(scan.images) < MIN_IMAGES:
+    if len(scan.images) < least:
         raise CalibrationError(
             f"{folder} holds {len(scan.images)} usable image{'s' * (len(scan.images) != 1)}"
             f"{''.join(f'; {warning}' for warning in scan.warnings)}; a calibration needs at least "
-            f"{MIN_IMAGES}: take more, with the board at other angles"
+            f"{least}: take more, with the board at other angles"
         )
     return replace(scan, warnings=scan.warnings + _cameras_alone(scan))
 
@@ -172,16 +172,15 @@ def _from_videos(
 
 
 def _cameras_alone(scan: Scan) -> tuple[str, ...]:
-    """A warning of every camera that never takes an image together with another."""
-    frames: Mapping[int, set[int]] = defaultdict(set)
+    """A warning of the cameras that never take an image together with another."""
+    cameras = defaultdict(set)
     for image in scan.images:
-        frames[image.camera].add(image.frame)
-    warnings = []
-    for camera, name in enumerate(scan.cameras):
-        others = set().union(*(own for number, own in frames.items() if number != camera))
-        if others and not frames[camera] & others:
-            warnings.append(
-                f"camera {name} shares no frame with another camera: its lens can be calibrated "
-                "and its place in the rig cannot; are its images named, or timed, as the others'?"
-            )
-    return tuple(warnings)
+        cameras[image.frame].add(image.camera)
+    together = {camera for own in cameras.values() if len(own) > 1 for camera in own}
+    alone = [name for camera, name in enumerate(scan.cameras) if camera not in together]
+    if not alone or len(scan.cameras) == 1:
+        return ()
+    return (
+        f"no frame shared with another camera by {', '.join(alone)}: the lens can be calibrated, "
+        "the place in the rig cannot; are images that were taken together matched rightly?",
+    )

@@ -33,6 +33,7 @@ NOTES = "notes.json"  # beside the frames: what there was to tell when they were
 # levels; a white square that leaves a black one moves by ten times as much.
 CHANGED_LEVELS = 10
 CHANGED_SHARE = 0.001  # of the image: a far board of 1 % of it that moves by a tenth of its size
+STILL_LEVELS = 0.2  # the mean change of a view that stands still: grain and compression
 RATES_DIFFER = 1.02  # frame numbers drift apart by a frame in 50
 AT_ONCE = 32  # frames between two looks at progress
 Progress = Callable[[str, int, int], None]
@@ -44,7 +45,7 @@ class Track:
     """What was seen of each frame of one video, as it is decoded."""
 
     changed: list[bool] = field(default_factory=list)  # since the last frame that was
-    speed: list[float] = field(default_factory=list)  # mean step since the frame before, in levels
+    step: list[float] = field(default_factory=list)  # mean change since the frame before, levels
     detail: list[float] = field(default_factory=list)  # log of the Laplacian's variance
     per_second: float = 0.0
     expected: int = 0
@@ -97,10 +98,13 @@ def pick_moments(frames: IntArray, tracks: list[Track], most: int) -> list[int]:
         ).T * np.where(seen, 1.0, 0.0)
 
     changed = at_moments([np.array(track.changed, float) for track in tracks]).any(axis=1)
-    speed = at_moments([np.array(track.speed) for track in tracks]).sum(axis=1)
+    # Held on both sides: a frame like the one before may be the last before a jerk.
+    steps = [np.array([*track.step, 0.0]) for track in tracks]
+    speed = at_moments([np.maximum(own[:-1], own[1:]) for own in steps]).sum(axis=1)
     # Beside the camera's usual detail: scenes differ more than the blur of a board.
     detail = at_moments([np.array(t.detail) - np.median(t.detail) for t in tracks]).sum(axis=1)
-    ranks = (rankdata(detail) + rankdata(-speed)) / (2 * len(frames) + 1)
+    # Blur is as long as the way during the exposure, so half the speed is worth half the blur.
+    ranks = rankdata(detail - np.log(speed + STILL_LEVELS)) / (len(frames) + 1)
     n_changes = int(changed.sum())
     travelled = (np.cumsum(changed) + 0.5) / (n_changes + 1)
     return sharpest_of_stretches(travelled, seen.sum(axis=1) + ranks, min(most, n_changes + 1))
@@ -124,7 +128,7 @@ def _watch(path: Path, track: Track) -> Iterator[None]:
         halved = (size[0] // 2, max(size[1] // 2, 1))
         now = np.asarray(cv2.resize(small, halved, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         before, last = (now if before is None else before), (now if last is None else last)
-        track.speed.append(float(cv2.absdiff(now, before).mean()))
+        track.step.append(float(cv2.absdiff(now, before).mean()))
         share = np.count_nonzero(cv2.absdiff(now, last) > CHANGED_LEVELS) / now.size
         track.changed.append(bool(share >= CHANGED_SHARE))
         before, last = now, (now if track.changed[-1] else last)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -40,7 +42,13 @@ def mapped(matrix, points):
 
 def render(board, tilt_deg, size=SIZE, **view):
     """The image and the true pixels of all corners."""
-    seen = homography(board, tilt_deg, size, **view)
+    image, truth = _rendered(board, tilt_deg, size, tuple(view.items()))
+    return image.copy(), truth
+
+
+@functools.cache
+def _rendered(board, tilt_deg, size, view):
+    seen = homography(board, tilt_deg, size, **dict(view))
     image = view_image(board, lambda pixels: mapped(np.linalg.inv(seen), pixels), size)
     return image, mapped(seen, board.corners_m[:, :2])
 
@@ -78,7 +86,7 @@ def test_corners_are_found_without_bias(board):
     ],
     ids=lambda board: board.described,
 )
-@pytest.mark.parametrize("turn_deg", [0, 80, 170, 260])
+@pytest.mark.parametrize("turn_deg", [0, 100, 190])
 def test_numbers_are_those_of_the_front(board, turn_deg):
     """Whichever way the board is turned; errors() knows of no mirrored numbering."""
     image, truth = render(board, (15, -20, turn_deg))
@@ -109,7 +117,7 @@ def test_a_mirrored_image_of_markers_is_no_board():
 
 @pytest.mark.parametrize("wanted", [(7, 5), (8, 4), (6, 4), (9, 5)])
 def test_part_of_another_checkerboard_is_not_this_one(wanted):
-    for tilt in (TILTED, FLAT_ON, TURNED):
+    for tilt in (TILTED, FLAT_ON):
         image, _ = render(CHECKERBOARD, tilt)
         assert detect(image, CHECKERBOARD.model_copy(update={"inner_corners": wanted})) is None
 
@@ -136,7 +144,7 @@ def test_nothing_is_found_where_there_is_nothing(board):
 
 
 def test_large_images_are_refined_at_full_scale():
-    image, truth = render(CHECKERBOARD, TILTED, size=(2600, 2000), focal_px=2400.0, distance_m=0.6)
+    image, truth = render(CHECKERBOARD, TILTED, size=(1600, 1200), focal_px=1500.0)
     found = detect(image, CHECKERBOARD)
     assert found is not None and np.abs(errors(found, CHECKERBOARD, truth)).max() < 0.05
 
@@ -146,8 +154,8 @@ def test_a_finger_on_a_corner_costs_that_corner():
     x, y = truth[19].round().astype(int)
     cv2.circle(image, (int(x) + 2, int(y) + 1), 7, 128, -1)
     found = detect(image, CHECKERBOARD)
-    if found is not None:  # OpenCV may need the whole board
-        assert np.abs(errors(found, CHECKERBOARD, truth)).max() < 0.3
+    assert found is not None and 19 not in found.corner and len(found.corner) >= len(truth) - 2
+    assert np.abs(errors(found, CHECKERBOARD, truth)).max() < 0.1
 
 
 @FOUR
@@ -158,7 +166,7 @@ def test_sigmas_track_the_scatter(board, blur_px, noise):
     image = cv2.GaussianBlur(image, (0, 0), blur_px).astype(float) * 0.6 + 40
     rng = np.random.default_rng(1)
     off, sigma = [], []
-    for _ in range(4):
+    for _ in range(3):
         noisy = np.clip(np.rint(image + noise * rng.standard_normal(image.shape)), 0, 255)
         found = detect(noisy.astype(np.uint8), board)
         assert found is not None

@@ -15,11 +15,11 @@ from sfm_calib.cache import Cache
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import read_scan
 
-SIZE = (400, 300)
-VIEW = {"size": SIZE, "focal_px": 400.0}
+SIZE = (320, 240)
+VIEW = {"size": SIZE, "focal_px": 350.0}
 CHECKERBOARD = Checkerboard(inner_corners=(6, 4), square_m=0.04)
 OTHER = Checkerboard(inner_corners=(7, 5), square_m=0.04)
-CHARUCO = Charuco(squares=(5, 4), square_m=0.05, marker_m=0.037)
+CHARUCO = Charuco(squares=(5, 4), square_m=0.05, marker_m=0.038)
 TILTS = [(20, -15, 5), (-20, 10, 170), (10, 25, 90), (5, 5, -80)]
 
 
@@ -89,7 +89,7 @@ def test_two_boards_in_one_scan_are_told(tmp_path):
 WRONG = [
     (CHARUCO, {"squares": (4, 5)}, "write 'squares: [5, 4]'"),
     (CHARUCO, {"inverted": True}, "write 'inverted: false'"),
-    (CHARUCO, {"dictionary": "DICT_6X6_250"}, "write 'dictionary: DICT_4X4_50'"),
+    (CHARUCO, {"dictionary": "DICT_6X6_50"}, "write 'dictionary: DICT_4X4_50'"),
     (CHARUCO, {"legacy": True}, "write 'legacy: false'"),
     (CHARUCO, {"squares": (7, 6)}, "ids up to 9, and the board has 21"),
     (Aprilgrid(tags=(3, 2), tag_m=0.06, spacing=0.3), {"border_bits": 1}, "'border_bits: 2'"),

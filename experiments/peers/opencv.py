@@ -16,7 +16,7 @@ from experiments.peers.calibrations import (
     residuals_of,
     rms,
 )
-from experiments.peers.sightings import of_camera
+from experiments.peers.sightings import common, of_camera
 from graphs.boards import N_SHAPE
 from graphs.camera import Camera
 from graphs.covariance import POSE_NAMES, Covariance
@@ -72,24 +72,21 @@ def calibrate_pair(
 ) -> PeerCalibration:
     """Two cameras by `cv2.stereoCalibrateExtended`, each calibrated alone before.
 
+    Of the pair it takes only corners that both cameras see at once.
     refined: lenses are estimated anew with the pair; else they are held. OpenCV states no sigmas
     of a pair: these are Gauss-Newton's at its optimum, of what it has estimated; held lenses keep
     the sigmas of each camera alone.
     """
     begin = time.perf_counter()
     alone = [calibrate_camera(of_camera(views, index), corners, lens) for index in (0, 1)]
-    by_frame = [
-        {view.frame: view for view in views.views if view.camera == index} for index in (0, 1)
-    ]
-    shared = sorted(set(by_frame[0]) & set(by_frame[1]))
-    boards = [corners[by_frame[0][frame].corner].astype(np.float32) for frame in shared]
-    seen = [
-        [each[frame].pixels[:, None].astype(np.float32) for frame in shared] for each in by_frame
-    ]
+    both = common(views)  # all that OpenCV takes
+    left, right = ([view for view in both.views if view.camera == index] for index in (0, 1))
+    boards, of_left = _points(left, corners)
+    of_right = _points(right, corners)[1]
     start = [_matrices(calibration.cameras[0]) for calibration in alone]
     flags = FLAGS[lens] | cv2.CALIB_USE_INTRINSIC_GUESS if refined else cv2.CALIB_FIX_INTRINSIC
     _, K1, d1, K2, d2, R, t, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
-        boards, *seen, *start[0], *start[1], views.sizes[0], None, None,
+        boards, of_left, of_right, *start[0], *start[1], views.sizes[0], None, None,
         flags=flags, criteria=CRITERIA,
     )  # fmt: skip
     cameras = tuple(
@@ -97,15 +94,14 @@ def calibrate_pair(
         for index, (K, coefficients) in enumerate(((K1, d1), (K2, d2)))
     )
     placed = {
-        frame: _transform(turn, shift)
-        for frame, turn, shift in zip(shared, turns, shifts, strict=True)
+        view.frame: _transform(turn, shift)
+        for view, turn, shift in zip(left, turns, shifts, strict=True)
     }
     pair = PeerCalibration(
         "OpenCV, refined" if refined else "OpenCV", cameras,
         (Transform.identity(), Transform(R, t.ravel())), placed, np.zeros(N_SHAPE),
         Covariance((), np.zeros((0, 0))), 0.0, seconds=time.perf_counter() - begin,
     )  # fmt: skip
-    both = replace(views, views=tuple(view for view in views.views if view.frame in shared))
     pair = _finished(pair, both, corners)
     lenses = [f"{camera.name}.{name}" for camera in cameras for name in camera.names]
     rig = [f"{cameras[1].name}.{name}" for name in POSE_NAMES]

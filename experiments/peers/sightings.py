@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from graphs.frames import FloatArray, Transform, angle_between
+from graphs.problem import BoolArray, IntArray
+from graphs.selection import MIN_CORNERS
+from sfm_calib.boards.detect import detect
 from sfm_calib.boards.spec import Board, Checkerboard
-from sfm_calib.boards.views import BoardView, BoardViews
+from sfm_calib.boards.views import BoardView, BoardViews, Detection
+
+Detector = Literal["ours", "opencv"]
+GrayImage = NDArray[np.uint8]
 
 IMAGES = ("*.png", "*.jpg")
 DETECTOR_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -41,12 +50,12 @@ DATA_SETS = {
 }
 
 
-def sightings(data: Path, data_set: DataSet) -> BoardViews:
-    """All views of the board in which all corners are found.
+def sightings(data: Path, data_set: DataSet, detector: Detector = "ours") -> BoardViews:
+    """All views of the board, as our detector finds it, or OpenCV's where that finds all corners.
 
     Raises FileNotFoundError where a camera has no image.
     """
-    found: dict[str, dict[int, FloatArray]] = {}
+    found: dict[str, dict[int, Detection]] = {}
     sizes: list[tuple[int, int]] = []
     for index, name in enumerate(data_set.cameras):
         folder = data / data_set.folder / name
@@ -55,16 +64,16 @@ def sightings(data: Path, data_set: DataSet) -> BoardViews:
             raise FileNotFoundError(f"{folder} has no images: give the folder that has the data")
         for path in paths:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            pixels = corners_in(image, data_set.board)
+            seen = _seen(image, data_set.board, detector)
             if len(sizes) == index:
                 sizes.append((image.shape[1], image.shape[0]))
-            if pixels is not None:
-                found.setdefault(_number(path.stem), {})[index] = pixels
+            if seen is not None:
+                found.setdefault(_number(path.stem), {})[index] = seen
     frames = sorted(found)
     views = tuple(
-        _view(camera, frame, found[frames[frame]][camera])
+        BoardView(camera, frame, seen.corner, seen.pixels, seen.sigma_px)
         for frame in range(len(frames))
-        for camera in sorted(found[frames[frame]])
+        for camera, seen in sorted(found[frames[frame]].items())
     )
     names = tuple(frames)
     return BoardViews(data_set.cameras, tuple(sizes), names, views)
@@ -75,16 +84,20 @@ def _number(stem: str) -> str:
     return "".join(character for character in stem if character.isdigit())
 
 
-def corners_in(image: FloatArray, board: Board) -> FloatArray | None:
+def corners_in(image: GrayImage, board: Board) -> FloatArray | None:
     """All corners (n, 2) of a chessboard in a grey image, row by row; None: not all are seen."""
     size = (board.columns, board.rows)
     seen, pixels = cv2.findChessboardCornersSB(image, size, flags=DETECTOR_FLAGS)
     return pixels.reshape(-1, 2).astype(np.float64) if seen else None
 
 
-def _view(camera: int, frame: int, pixels: FloatArray) -> BoardView:
-    n = len(pixels)
-    return BoardView(camera, frame, np.arange(n), pixels, np.full(n, CORNER_SIGMA_PX))
+def _seen(image: GrayImage, board: Board, detector: Detector) -> Detection | None:
+    if detector == "ours":
+        return detect(image, board)
+    pixels = corners_in(image, board)
+    if pixels is None:
+        return None
+    return Detection(np.arange(len(pixels)), pixels, np.full(len(pixels), CORNER_SIGMA_PX))
 
 
 def of_frames(views: BoardViews, frames: Sequence[int]) -> BoardViews:
@@ -97,6 +110,25 @@ def of_camera(views: BoardViews, camera: int) -> BoardViews:
     """The views of one camera, as if there were no other; frames keep their numbers."""
     kept = tuple(replace(view, camera=0) for view in views.views if view.camera == camera)
     return BoardViews((views.cameras[camera],), (views.sizes[camera],), views.frames, kept)
+
+
+def common(views: BoardViews) -> BoardViews:
+    """Of each frame that all cameras see, the corners that all of them see."""
+    by_frame = {
+        frame: [view for view in views.views if view.frame == frame] for frame in frames_of(views)
+    }
+    kept = []
+    for seen in by_frame.values():
+        corner = reduce(np.intersect1d, [view.corner for view in seen])
+        if len(seen) == len(views.cameras) and len(corner) >= MIN_CORNERS:
+            kept += [_chosen(view, np.isin(view.corner, corner)) for view in seen]
+    return replace(views, views=tuple(kept))
+
+
+def _chosen(view: BoardView, rows: BoolArray | IntArray) -> BoardView:
+    return replace(
+        view, corner=view.corner[rows], pixels=view.pixels[rows], sigma_px=view.sigma_px[rows]
+    )
 
 
 def frames_of(views: BoardViews) -> list[int]:
@@ -130,11 +162,7 @@ def consistent(
                 index = place[camera, frame]
                 view = renumbered[index]
                 corner = board.symmetries[0][view.corner]
-                order = np.argsort(corner)
-                renumbered[index] = replace(
-                    view, corner=corner[order], pixels=view.pixels[order],
-                    sigma_px=view.sigma_px[order],
-                )  # fmt: skip
+                renumbered[index] = _chosen(replace(view, corner=corner), np.argsort(corner))
                 count += 1
     return replace(views, views=tuple(renumbered)), count
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from sfm_calib.boards.spec import DICTIONARIES, Aprilgrid, Board, Charuco, Check
 
 GrayImage = NDArray[np.uint8]
 Images = Sequence[GrayImage]
+Markers = tuple[str, int] | None  # their dictionary, and the largest id
 
 LOOK_PX = 320_000  # sizes of checkerboards are read in images of about so many pixels
 SHARE = 1 / 3  # of the images, that must show something else before it is said
@@ -24,12 +25,14 @@ FEWEST = 2  # images of them
 SIZES_TRIED = 4  # of checkerboards, the most frequent ones
 SMALLEST, LARGEST = 3, 14  # inner corners along a side of the checkerboards looked for
 FEWEST_MARKERS = 3  # in an image: one or two are misread now and then
-# Dictionaries of which the smaller ones of the same name are the beginning.
-WHOLE_DICTIONARIES = (
-    "DICT_4X4_1000",
-    "DICT_5X5_1000",
-    "DICT_6X6_1000",
-    "DICT_7X7_1000",
+DICTIONARY_SAMPLE = 4  # images in which markers of every dictionary are looked for
+# Of those of one name and several sizes, the smaller are the beginning of the larger; the largest
+# take four times as long, and boards begin with marker 0.
+DICTIONARIES_TRIED = (
+    "DICT_4X4_250",
+    "DICT_5X5_250",
+    "DICT_6X6_250",
+    "DICT_7X7_250",
     "DICT_ARUCO_ORIGINAL",
     "DICT_ARUCO_MIP_36h12",
     "DICT_APRILTAG_36h11",
@@ -40,20 +43,33 @@ WHOLE_DICTIONARIES = (
 
 def why_not(board: Board, images: Images) -> str:
     """What the images show instead of the board, and what to do, for the end of a message."""
-    best, most = "", 0
-    for remedy, changed in _variants(board, images):
-        count = _times_found(changed, images)
-        if count > most:
-            best, most = remedy, count
-    if _is_many(most, images):
-        return f"{most} of {len(images)} images looked at again show it so: {best}"
-    other = _other_markers(board, images) or another_board(board, images)
+    said = _best_of(_variants(board), images)
+    if said:
+        return said
+    markers = _markers_seen(images[:: -(-len(images) // DICTIONARY_SAMPLE)], board)
+    if isinstance(board, Charuco):
+        said = _best_of(_with_dictionary(board, markers), images)
+        if said:
+            return said
+    other = _other_markers(board, markers) or another_board(board, images)
     if other:
         return other
     return (
         f"the {len(images)} images looked at again show no board of another kind or size either; "
         "show all of it, sharp, with its white margin, and not at a flat angle"
     )
+
+
+def _best_of(variants: Iterable[tuple[str, Board]], images: Images) -> str | None:
+    """What to write, where many of the images show one of the variants of a board."""
+    best, most = "", 0
+    for remedy, changed in variants:
+        count = _times_found(changed, images)
+        if count > most:
+            best, most = remedy, count
+    if not _is_many(most, images):
+        return None
+    return f"{most} of {len(images)} images looked at again show it so: {best}"
 
 
 def another_board(board: Board, images: Images) -> str | None:
@@ -99,7 +115,7 @@ def _checkerboard_size(image: GrayImage) -> tuple[int, int] | None:
     return max(cells.shape), min(cells.shape)
 
 
-def _variants(board: Board, images: Images) -> Iterator[tuple[str, Board]]:
+def _variants(board: Board) -> Iterator[tuple[str, Board]]:
     """Boards that the user may have meant, each with what to write instead."""
     yield from _turned(board)
     if isinstance(board, Charuco | Aprilgrid | Circles):
@@ -112,8 +128,6 @@ def _variants(board: Board, images: Images) -> Iterator[tuple[str, Board]]:
             "through on the back of the board",
             board.model_copy(update={"two_sided": True}),
         )
-    if isinstance(board, Charuco):
-        yield from _with_dictionary(board, images)
 
 
 def _turned(board: Board) -> Iterator[tuple[str, Board]]:
@@ -144,12 +158,11 @@ def _turned(board: Board) -> Iterator[tuple[str, Board]]:
         )
 
 
-def _with_dictionary(board: Charuco, images: Images) -> Iterator[tuple[str, Board]]:
+def _with_dictionary(board: Charuco, markers: Markers) -> Iterator[tuple[str, Board]]:
     """The board with the markers that the images show, in both layouts."""
-    found = _dictionary_seen(images, board.inverted)
-    if found is None or found[0] == board.dictionary:
+    if markers is None or markers[0] == board.dictionary:
         return
-    name = found[0]
+    name = markers[0]
     for legacy in (board.legacy, not board.legacy):
         text = f"write 'dictionary: {name}'"
         if legacy != board.legacy:
@@ -157,12 +170,11 @@ def _with_dictionary(board: Charuco, images: Images) -> Iterator[tuple[str, Boar
         yield text, board.model_copy(update={"dictionary": name, "legacy": legacy})
 
 
-def _other_markers(board: Board, images: Images) -> str | None:
+def _other_markers(board: Board, markers: Markers) -> str | None:
     """That the images show markers, where those of the board do not fit."""
-    found = _dictionary_seen(images, bool(getattr(board, "inverted", False)))
-    if found is None:
+    if markers is None:
         return None
-    seen = f"the images looked at again show markers of {found[0]} with ids up to {found[1]}"
+    seen = f"the images looked at again show markers of {markers[0]} with ids up to {markers[1]}"
     if isinstance(board, Charuco):
         n_markers = len(marker_squares(board))
         return f"{seen}, and the board has {n_markers}: count its squares again"
@@ -171,16 +183,19 @@ def _other_markers(board: Board, images: Images) -> str | None:
     return f"{seen}: is it a ChArUco board?"
 
 
-def _dictionary_seen(images: Images, inverted: bool) -> tuple[str, int] | None:
+def _markers_seen(images: Images, board: Board) -> Markers:
     """The smallest dictionary that has the markers of many of the images, and the largest id."""
     best, most = None, 0
-    for name in WHOLE_DICTIONARIES:
+    parameters = cv2.aruco.DetectorParameters()
+    if isinstance(board, Aprilgrid):
+        parameters.markerBorderBits = board.border_bits
+    for name in DICTIONARIES_TRIED:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        detector = cv2.aruco.ArucoDetector(dictionary)
+        detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         count, largest = 0, 0
         for image in images:
-            small, _ = reduced(255 - image if inverted else image, READ_PX)
-            found, ids, _ = detector.detectMarkers(small)
+            positive = 255 - image if getattr(board, "inverted", False) else image
+            found, ids, _ = detector.detectMarkers(reduced(positive, READ_PX)[0])
             if len(found) >= FEWEST_MARKERS:
                 count += 1
                 largest = max(largest, int(np.max(ids)))
@@ -192,7 +207,7 @@ def _dictionary_seen(images: Images, inverted: bool) -> tuple[str, int] | None:
 def _smallest(name: str, largest_id: int) -> str:
     """The smallest dictionary of the same markers with an id."""
     stem = name.rsplit("_", 1)[0]
-    if not name.endswith("_1000"):
+    if not name.endswith("_250"):
         return name
     sizes = sorted(int(each.rsplit("_", 1)[1]) for each in DICTIONARIES if each.startswith(stem))
     return f"{stem}_{next(size for size in sizes if size > largest_id)}"

@@ -19,6 +19,7 @@ GrayImage = NDArray[np.uint8]
 
 FIRST_BLUR_PX = 0.7  # as for saddles
 SMALLEST_PX = 1.2  # radius: a smaller disc is a dot whose blur cannot be told from its size
+TWO_BY_ROOT_PI = float(2 / np.sqrt(np.pi))
 LEAST_CONTRAST = 4.0  # grey levels between black and white, halved
 
 
@@ -51,10 +52,11 @@ def fit_discs(
     good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
     radius_px = np.abs(fits.parameters[:, 2] * fits.parameters[:, 4]) ** -0.5
-    return Discs(centres, fit.centre_sigmas(fits, windows), radius_px, good)
+    sigma_px = fit.centre_sigmas(fits, windows, good)
+    return Discs(centres, sigma_px, radius_px, good & (sigma_px < fit.MOST_SIGMA_PX))
 
 
-def _model(parameters: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _model(parameters: fit.Values, offsets: fit.Values) -> tuple[fit.Values, fit.Values]:
     """Grey levels (n, p) and their Jacobian (n, p, 10) by the centre, a, b and c, the log of the
     blur, the contrast, the mean and the slope.
 
@@ -71,17 +73,18 @@ def _model(parameters: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Flo
     width, narrowing = fit.blur_width(parameters[:, 5, None])
     ratio = distance / width
     side = erf(ratio)
-    bell = parameters[:, 6, None] * 2 / np.sqrt(np.pi) * np.exp(-(ratio**2)) / width
+    bell = parameters[:, 6, None] * TWO_BY_ROOT_PI * np.exp(-(ratio**2)) / width
     # d distance = (1 - 2 norm) / slope dnorm - distance / slope dslope
     by_norm, by_slope = (1 - 2 * norm) / slope, -distance / slope
 
-    def along(d_w0: FloatArray, d_w1: FloatArray, d_g0: FloatArray, d_g1: FloatArray) -> FloatArray:
+    def along(*changes: fit.Values) -> fit.Values:
+        d_w0, d_w1, d_g0, d_g1 = changes
         d_norm = (w0 * d_w0 + w1 * d_w1) / norm
         d_slope = (g0 * d_g0 + g1 * d_g1) / slope
         return np.asarray(bell * (by_norm * d_norm + by_slope * d_slope))
 
     zero = 0 * x
-    jacobian = np.empty((*x.shape, 10))
+    jacobian = np.empty((*x.shape, 10), parameters.dtype)
     jacobian[..., 0] = along(-a + zero, zero, -a * a + zero, -a * b + zero)
     jacobian[..., 1] = along(-b + zero, -c + zero, -a * b + zero, -b * b - c * c + zero)
     jacobian[..., 2] = along(x, zero, w0 + a * x, b * x)

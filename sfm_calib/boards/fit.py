@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve
 
 from graphs.frames import FloatArray
 
 # values (n, p) and Jacobian (n, p, k) at parameters (n, k) and offsets (n, p, 2) from the window's
 # middle.
-Model = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Values = NDArray[np.floating]
+Model = Callable[[Values, Values], tuple[Values, Values]]
 
 ITERATIONS = 12
 FIRST_DAMPING = 1e-3
@@ -23,6 +25,7 @@ FEWEST_SPARE = 4  # pixels beyond the number of parameters
 # is far noisier than the others, as where a finger covers a part.
 MOST_LEFT = 0.4
 ODD_NOISE, ODD_SHARE = 6.0, 0.03
+MOST_SIGMA_PX = 1.0  # a centre that is known less well is not found
 STILL_PX = 1e-3  # a step that moves no centre farther is the last
 PIXEL_PX = 0.3  # sigma of the blur by a pixel's own area, 1 / sqrt(12): no edge is sharper
 LAGS = 2  # px within which a sensor's or a codec's noise is taken to be correlated
@@ -31,7 +34,7 @@ QUANTISATION = 1 / 12  # variance of rounding to grey levels: no image has less 
 PRIOR_PIXELS = 20
 
 
-def blur_width(log_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
+def blur_width(log_blur: Values) -> tuple[Values, Values]:
     """Width of the error function of an edge with a blur of this sigma (log px) and the pixel's
     own, and the derivative of the width's log."""
     lens = np.exp(2 * log_blur)
@@ -44,9 +47,9 @@ class Windows:
     """Round windows of an image around whole pixels, with the pixels that count in each."""
 
     middle: FloatArray  # (n, 2) whole pixels
-    offsets: FloatArray  # (p, 2) from the middle
-    values: FloatArray  # (n, p) grey levels
-    counts: FloatArray  # (n, p) 1 or 0
+    offsets: Values  # (p, 2) from the middle
+    values: Values  # (n, p) grey levels
+    counts: Values  # (n, p) 1 or 0
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,8 @@ class Fits:
     """Fitted windows; parameters 0 and 1 of each are the centre, in px from the middle."""
 
     parameters: FloatArray  # (n, k)
-    residuals: FloatArray  # (n, p), 0 where a pixel does not count
-    jacobian: FloatArray  # (n, p, k)
+    residuals: Values  # (n, p), 0 where a pixel does not count
+    jacobian: Values  # (n, p, k)
 
 
 def cut(
@@ -75,7 +78,12 @@ def cut(
     column, row = np.clip(place[..., 0], 0, width - 1), np.clip(place[..., 1], 0, height - 1)
     squared = ((place - centres[:, None]) ** 2).sum(axis=-1)
     counts = inside & (squared <= radii_px[:, None] ** 2)
-    return Windows(middle, offsets.astype(float), image[row, column].astype(float), counts * 1.0)
+    return Windows(
+        middle,
+        offsets.astype(np.float32),
+        image[row, column].astype(np.float32),
+        counts.astype(np.float32),
+    )
 
 
 def fit_centres(
@@ -125,7 +133,7 @@ def is_explained(windows: Windows, fits: Fits) -> NDArray[np.bool_]:
     return np.asarray((left < MOST_LEFT) & ~strange)
 
 
-def _mean(values: FloatArray, windows: Windows) -> FloatArray:
+def _mean(values: Values, windows: Windows) -> FloatArray:
     total = np.maximum(windows.counts.sum(axis=1), 1.0)
     result: FloatArray = (values * windows.counts).sum(axis=1) / total
     return result
@@ -143,7 +151,7 @@ def _with_levels(
     """The start with its centre, and the contrast and mean that fit best to it."""
     result = _moved(start, pixels - windows.middle)
     result[:, contrast] = 1.0
-    shape, _ = model(result, windows.offsets)
+    shape, _ = model(result.astype(np.float32), windows.offsets)
     shape_mean = _mean(shape, windows)
     centred = (shape - shape_mean[:, None]) * windows.counts
     power = np.maximum((centred**2).sum(axis=1), 1e-9)
@@ -157,12 +165,12 @@ def fit(model: Model, windows: Windows, start: FloatArray) -> Fits:
     parameters = start.copy()
     damping = np.full(len(start), FIRST_DAMPING)
     residuals, jacobian = _linearise(model, windows, np.arange(len(start)), parameters)
-    cost = (residuals**2).sum(axis=1)
+    cost = (residuals**2).sum(axis=1, dtype=float)
     moving = np.arange(len(start))
     for _ in range(ITERATIONS):
         step = _step(jacobian[moving], residuals[moving], damping[moving])
         tried, slopes = _linearise(model, windows, moving, parameters[moving] + step)
-        tried_cost = (tried**2).sum(axis=1)
+        tried_cost = (tried**2).sum(axis=1, dtype=float)
         better = tried_cost <= cost[moving]  # False where it is NaN
         now = moving[better]
         parameters[now] += step[better]
@@ -174,10 +182,10 @@ def fit(model: Model, windows: Windows, start: FloatArray) -> Fits:
     return Fits(parameters, residuals, jacobian)
 
 
-def _step(jacobian: FloatArray, residuals: FloatArray, damping: FloatArray) -> FloatArray:
+def _step(jacobian: Values, residuals: Values, damping: FloatArray) -> FloatArray:
     """Steps (n, k) of damped Gauss-Newton."""
-    normal = np.matmul(jacobian.transpose(0, 2, 1), jacobian)
-    gradient = np.einsum("npk,np->nk", jacobian, residuals)
+    normal = np.matmul(jacobian.transpose(0, 2, 1), jacobian).astype(float)
+    gradient = np.einsum("npk,np->nk", jacobian, residuals).astype(float)
     scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-12))
     scaled = normal / (scale[:, :, None] * scale[:, None, :])
     scaled += damping[:, None, None] * np.eye(jacobian.shape[2])
@@ -187,12 +195,12 @@ def _step(jacobian: FloatArray, residuals: FloatArray, damping: FloatArray) -> F
 
 def _linearise(
     model: Model, windows: Windows, which: NDArray[np.intp], parameters: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Values, Values]:
     """Residuals and Jacobian of the windows `which` (m,) at their parameters (m, k)."""
     with np.errstate(all="ignore"):  # a step too far is undone
-        values, jacobian = model(parameters, windows.offsets)
+        values, jacobian = model(parameters.astype(np.float32), windows.offsets)
         counts = windows.counts[which]
-        residuals: FloatArray = (values - windows.values[which]) * counts
+        residuals = (values - windows.values[which]) * counts
         slopes = jacobian * counts[..., None]
     usable = np.isfinite(residuals).all(axis=1) & (np.abs(slopes) < MOST_SLOPE).all(axis=(1, 2))
     residuals[~usable] = np.inf  # larger than any
@@ -200,62 +208,61 @@ def _linearise(
     return residuals, slopes
 
 
-def centre_sigmas(fits: Fits, windows: Windows) -> FloatArray:
-    """Sigma (n,) in px of the fitted centres along their worst direction.
+def centre_sigmas(fits: Fits, windows: Windows, good: NDArray[np.bool_]) -> FloatArray:
+    """Sigma (n,) in px of the centres of `good` fits along their worst direction; inf of others.
 
     The noise is that of the residuals, with its correlation between neighbouring pixels; it
     reaches the centre through the fit's own linear map. For white noise that is the Cramer-Rao
     bound of the model.
     """
-    n_windows, n_parameters = fits.parameters.shape
-    pixels = windows.counts.sum(axis=1)
-    freedom = np.maximum(pixels - n_parameters, 1.0)
-    squares = (fits.residuals**2).sum(axis=1)
+    sigma: FloatArray = np.full(len(good), np.inf)
+    if not good.any():
+        return sigma
+    jacobian, residuals, counts = fits.jacobian[good], fits.residuals[good], windows.counts[good]
+    freedom = np.maximum(counts.sum(axis=1) - jacobian.shape[2], 1.0)
+    squares = (residuals**2).sum(axis=1)
     typical = float(np.median(squares / freedom))
     variance = (squares + PRIOR_PIXELS * typical) / (freedom + PRIOR_PIXELS)
-    normal = np.einsum("npk,npl->nkl", fits.jacobian, fits.jacobian, optimize=True)
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    influence = np.einsum("nkl,npl->npk", inverse[:, :2], fits.jacobian, optimize=True)
+    normal = np.matmul(jacobian.transpose(0, 2, 1), jacobian).astype(float)
+    inverse = np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32)
+    influence = np.matmul(jacobian, inverse.transpose(0, 2, 1))  # (n, p, 2)
     place = (windows.offsets - windows.offsets.min(axis=0)).astype(int)
     side = int(place.max()) + 1
-    residuals = np.zeros((n_windows, side, side))
-    residuals[:, place[:, 1], place[:, 0]] = fits.residuals
-    correlation = _correlation(residuals)
-    spread = np.zeros((n_windows, side, side, 2))
-    spread[:, place[:, 1], place[:, 0]] = influence
-    covariance = np.zeros((n_windows, 2, 2))
-    for (down, right), share in correlation.items():
-        one, other = _shifted(spread, down, right)
-        part = np.einsum("nyxa,nyxb->nab", one, other)
-        covariance += share * (part + part.transpose(0, 2, 1)) / 2
-    worst = np.linalg.eigvalsh(covariance)[:, -1]
-    white = np.linalg.eigvalsh(np.einsum("npa,npb->nab", influence, influence))[:, -1]
-    sigma: FloatArray = np.sqrt(np.maximum(variance, QUANTISATION) * np.maximum(worst, white))
+
+    def gridded(values: Values) -> Values:
+        grid = np.zeros((len(values), side, side, values.shape[2]), np.float32)
+        grid[:, place[:, 1], place[:, 0]] = values
+        return grid
+
+    correlation = _correlation(gridded(residuals[..., None])[..., 0], gridded(counts[..., None]))
+    spread = gridded(influence)
+    smeared = convolve(spread, correlation[None, :, :, None], mode="constant")
+    flat = spread.reshape(len(spread), -1, 2).transpose(0, 2, 1)
+    covariance = np.matmul(flat, smeared.reshape(len(spread), -1, 2)).astype(float)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+    white = np.matmul(influence.transpose(0, 2, 1), influence).astype(float)
+    worst = np.maximum(np.linalg.eigvalsh(covariance), np.linalg.eigvalsh(white))[:, -1]
+    sigma[good] = np.sqrt(np.maximum(variance, QUANTISATION) * worst)
     return sigma
 
 
-def _correlation(residuals: FloatArray) -> dict[tuple[int, int], float]:
-    """Autocorrelation of residuals (n, side, side), 0 where no pixel counts, by lag."""
-    result = {}
-    power = max(float((residuals**2).mean()), 1e-12)
-    count = np.count_nonzero(residuals) / residuals.size
-    for down in range(-LAGS, LAGS + 1):
+def _correlation(residuals: Values, counts: Values) -> Values:
+    """Autocorrelation (2 LAGS + 1, 2 LAGS + 1) of residuals (n, side, side), by lag."""
+    counted = counts[..., 0]
+    power = max(float((residuals**2).sum() / counted.sum()), 1e-12)
+    result = np.zeros((2 * LAGS + 1, 2 * LAGS + 1), np.float32)
+    for down in range(LAGS + 1):
         for right in range(-LAGS, LAGS + 1):
             one, other = _shifted(residuals, down, right)
-            both = np.count_nonzero(one * other) / max(residuals.size, 1)
-            mean = float((one * other).sum()) / residuals.size
-            result[down, right] = mean / power * count / both if both else 0.0
+            both = np.multiply(*_shifted(counted, down, right)).sum()
+            share = float((one * other).sum() / both) / power if both else 0.0
+            # The same the other way.
+            result[LAGS + down, LAGS + right] = result[LAGS - down, LAGS - right] = share
     return result
 
 
-def _shifted(grid: FloatArray, down: int, right: int) -> tuple[FloatArray, FloatArray]:
-    """The parts of (n, height, width, ...) that lie over each other when one is shifted."""
-
-    def cut_to(step: int) -> tuple[slice, slice]:
-        ahead, behind = slice(step, None), slice(None, -step)
-        if step == 0:
-            return slice(None), slice(None)
-        return (ahead, behind) if step > 0 else (slice(None, step), slice(-step, None))
-
-    (y, y_other), (x, x_other) = cut_to(down), cut_to(right)
-    return grid[:, y, x], grid[:, y_other, x_other]
+def _shifted(grid: Values, down: int, right: int) -> tuple[Values, Values]:
+    """The parts of (n, height, width) that lie over each other when one is shifted."""
+    height, width = grid.shape[1:]
+    one = grid[:, down:, max(right, 0) : width + min(right, 0)]
+    return one, grid[:, : height - down, max(-right, 0) : width + min(-right, 0)]

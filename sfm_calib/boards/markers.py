@@ -30,7 +30,10 @@ CLEAR = 0.9
 MOST_MISFIT = 0.25
 GROWTH = 4  # rounds in which corners beside known ones are looked for
 REACH, PREDICTORS = 1.6, 4  # how far beside them, in sides of a square or tag; and from how many
-LEAST_CONTRAST = 0.35  # of the board's typical corner: an occluder's edges are weaker or stronger
+# Contrast beside the board's typical corner, at least (and at most its inverse): edges of occluders
+# are otherwise. Corners that no marker speaks for must be more alike: with the first limit alone 13
+# come into 48 video frames with a hand on the board, some 4 px off; with these 7, all of them good.
+LEAST_CONTRAST, GROWN_CONTRAST, GROWN_SIGMA = 0.35, 0.6, 3.0
 # Kalibr's corner of a tag (row up, column) for each of OpenCV's four. OpenCV keeps AprilTags turned
 # by half a turn, and goes clockwise from the top left: here the bottom right.
 TAG_CORNERS = ((0, 1), (0, 0), (1, 0), (1, 1))
@@ -122,7 +125,7 @@ def _fitted(
     # Black and white change places from one corner to the next, in both types.
     chequers = _chequers(board)
     level = np.median((saddles.contrast * chequers[numbers])[saddles.good])
-    good = saddles.good & _is_like(saddles.contrast * chequers[numbers], level)
+    good = saddles.good & _is_like(saddles.contrast * chequers[numbers], level, LEAST_CONTRAST)
     seen = Detection(numbers[good], saddles.pixels[good], saddles.sigma_px[good])
     for _ in range(GROWTH):
         grown = _grown(image, board, seen, clear_m, float(level))
@@ -143,9 +146,9 @@ def _chequers(board: Board) -> IntArray:
     return np.asarray(1 - 2 * ((row + column) % 2))
 
 
-def _is_like(contrast: FloatArray, level: float) -> NDArray[np.bool_]:
+def _is_like(contrast: FloatArray, level: float, least: float) -> NDArray[np.bool_]:
     share = contrast / level
-    return np.asarray((share > LEAST_CONTRAST) & (share < 1 / LEAST_CONTRAST))
+    return np.asarray((share > least) & (share < 1 / least))
 
 
 def _grown(
@@ -171,8 +174,11 @@ def _grown(
     saddles = fit_saddles(image, guess, guess_map, CLEAR * clear_m)
     spread = np.linalg.norm(saddles.pixels - guess, axis=1)
     closest = clear_m * np.linalg.norm(guess_map, -2, axis=(1, 2))
-    good = saddles.good & _is_like(saddles.contrast * _chequers(board)[others], level)
+    good = saddles.good & _is_like(
+        saddles.contrast * _chequers(board)[others], level, GROWN_CONTRAST
+    )
     good &= spread < CLEAR * closest
+    good &= saddles.sigma_px < GROWN_SIGMA * np.median(seen.sigma_px)
     if not good.any():
         return None
     numbers = np.concatenate([seen.corner, others[good]])

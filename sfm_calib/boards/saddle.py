@@ -20,6 +20,7 @@ GrayImage = NDArray[np.uint8]
 
 NARROWEST_PX, WIDEST_PX = 2.2, 10.0  # radius of the window: fewer pixels say too little
 FIRST_BLUR_PX = 0.7  # sigma; a pixel's own area makes 0.3, lenses and demosaicing the rest
+TWO_BY_ROOT_PI = float(2 / np.sqrt(np.pi))
 LEAST_CONTRAST = 4.0  # grey levels between black and white, halved
 
 
@@ -49,10 +50,11 @@ def fit_saddles(image: GrayImage, pixels: FloatArray, maps: FloatArray, clear: f
     good = found & (np.abs(contrast) > LEAST_CONTRAST)
     good &= fit.is_explained(windows, fits)
     centres = windows.middle + fits.parameters[:, :2]
-    return Saddles(centres, fit.centre_sigmas(fits, windows), contrast, good)
+    sigma_px = fit.centre_sigmas(fits, windows, good)
+    return Saddles(centres, sigma_px, contrast, good & (sigma_px < fit.MOST_SIGMA_PX))
 
 
-def _model(parameters: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _model(parameters: fit.Values, offsets: fit.Values) -> tuple[fit.Values, fit.Values]:
     """Grey levels (n, p) and their Jacobian (n, p, 9) by the centre, the angles of the edges, the
     log of the blur, the contrast, the mean and the slope."""
     place = offsets[None] - parameters[:, None, :2]  # (n, p, 2)
@@ -65,8 +67,8 @@ def _model(parameters: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Flo
         along.append(place[..., 0] * cos + place[..., 1] * sin)
         ratio = across[-1] / width
         sides.append(erf(ratio))
-        bells.append(2 / np.sqrt(np.pi) * np.exp(-(ratio**2)) / width)
-    jacobian = np.empty((*across[0].shape, 9))
+        bells.append(TWO_BY_ROOT_PI * np.exp(-(ratio**2)) / width)
+    jacobian = np.empty((*across[0].shape, 9), parameters.dtype)
     per_edge = (contrast * bells[0] * sides[1], contrast * bells[1] * sides[0])
     jacobian[..., 0] = 0
     jacobian[..., 1] = 0
