@@ -21,6 +21,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.calibrate import (
     Outcome,
     Stopwatch,
+    checked_scan,
     determine,
     enough_placed,
     mapped_scan,
@@ -50,10 +51,11 @@ def calibrate_with_board(
     As `calibrate`. Raises CalibrationError also where the board is found nowhere.
     """
     watch = Stopwatch()
-    given, problem = mapped_scan(scan_path, config, cache, progress, command, watch)
-    with watch.stage("finding the board"):
-        views = views_of_board(given.scan, board, board_images, config, cache, progress)
-    with enough_placed(problem, len(given.scan.images)):
+    scan = checked_scan(scan_path, config, cache, progress, watch)
+    with watch.stage("finding the board"):  # before the mapping, which takes far longer
+        views = views_of_board(scan, board, board_images, config, cache, progress)
+    given, problem = mapped_scan(scan, config, cache, progress, command, watch)
+    with enough_placed(problem, len(scan.images)):
         with watch.stage("placing the board"):
             alone = solve_problem(problem, config, progress)
             with refusals():

@@ -26,8 +26,11 @@ def board_result(run: Run) -> BoardResult | None:
     sigma = shape_sigmas(
         run.refinement.graph, estimate, run.refinement.values, run.covariance.inflation
     )
-    bends, of_bends = 1e3 * np.exp(shape[0]) * shape[1:N_WHOLE], 1e3 * sigma[1:N_WHOLE]
-    held = problem.board.board.shape_sigma[1:N_WHOLE] == 0
+    whole = slice(1, N_WHOLE)
+    held = problem.board.board.shape_sigma[whole] == 0
+    # the solver holds a bend by a tiny sigma, and leaves a trace of it
+    bend_m = np.where(held, problem.board.board.shape_mean[whole], shape[whole])
+    bends, of_bends = 1e3 * np.exp(shape[0]) * bend_m, 1e3 * sigma[whole]
     off = shape[N_WHOLE:].reshape(-1, 3)
     return BoardResult(
         description=use.board.described,

@@ -35,10 +35,13 @@ class BoardUse:
         found = []
         if self.left_out:
             listed = some(list(self.left_out))
-            found.append(f"{len(self.left_out)} views of the board were left out: {listed}")
+            what = "view of the board was" if len(self.left_out) == 1 else "views of the board were"
+            found.append(f"{len(self.left_out)} {what} left out: {listed}")
         if self.repeated:
+            few = len(self.repeated) == 1
             found.append(
-                f"{len(self.repeated)} groups of frames show the board in one place, and tell "
-                f"little more than one of each: {'; '.join(self.repeated[:3])}"
+                f"{len(self.repeated)} group{'s' * (not few)} of frames show{'s' * few} the board "
+                f"in one place, and tell{'s' * few} little more than one of each: "
+                f"{'; '.join(self.repeated[:3])}"
             )
         return tuple(found)

@@ -22,7 +22,7 @@ from sfm_calib.board_use import Without
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.images import Progress, read_scan
+from sfm_calib.images import Progress, Scan, read_scan
 from sfm_calib.mapping import map_scan
 from sfm_calib.nominal import (
     check_config,
@@ -74,13 +74,24 @@ def calibrate(
     Raises CalibrationError with cause, number and remedy when the scan does not allow it.
     """
     watch = Stopwatch()
-    given, problem = mapped_scan(scan_path, config, cache, progress, command, watch)
-    with enough_placed(problem, len(given.scan.images)):
+    scan = checked_scan(scan_path, config, cache, progress, watch)
+    given, problem = mapped_scan(scan, config, cache, progress, command, watch)
+    with enough_placed(problem, len(scan.images)):
         return determine(given, problem, watch, progress)
 
 
+def checked_scan(
+    scan_path: Path, config: RigConfig, cache: Cache, progress: Progress, watch: Stopwatch
+) -> Scan:
+    """The images of a scan, which the configuration fits."""
+    with watch.stage("reading images"):
+        scan = read_scan(scan_path, cache, config.frames, config.video_frames, progress)
+        check_config(config, scan)
+    return scan
+
+
 def mapped_scan(
-    scan_path: Path,
+    scan: Scan,
     config: RigConfig,
     cache: Cache,
     progress: Progress,
@@ -88,9 +99,6 @@ def mapped_scan(
     watch: Stopwatch,
 ) -> tuple[Given, Problem]:
     """A scan's problem, started as rig.yaml has it, and what it came from."""
-    with watch.stage("reading images"):
-        scan = read_scan(scan_path, cache, config.frames, config.video_frames, progress)
-        check_config(config, scan)
     lenses = [lens_of(config, name, len(scan.cameras)) for name in scan.cameras]
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)

@@ -173,6 +173,8 @@ def run_target(command: Target, arguments: Sequence[str]) -> None:
     assert isinstance(again, Target)
     config = from_file.with_options(again.options)
     truth = load_calibration(command.truth) if command.truth else None
+    if truth:
+        check_same_cameras(camera_names(command.images), truth)  # now rather than after the work
     with output_folder(command.out):
         with progress_bars() as progress:
             cache = Cache(command.out / "cache", command.fresh)
