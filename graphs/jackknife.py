@@ -67,7 +67,7 @@ def blocks_of(problem: Problem, most: int = BLOCKS) -> IntArray:
     if of_board.any() and not of_board.all():  # each block takes its share of both kinds
         for kind in (of_board, ~of_board):
             place[kind] = (np.arange(kind.sum()) + 0.5) / kind.sum()
-    block: IntArray = (place * count).astype(np.int64)
+    block: IntArray = np.unique((place * count).astype(np.int64), return_inverse=True)[1]
     return block
 
 
