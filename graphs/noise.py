@@ -66,9 +66,7 @@ def redundancies(problem: Problem, options: GraphOptions | None = None) -> Float
     # A corner's place is given; its frame has few others to take its own place from.
     in_frame = np.bincount(seen.frame)[seen.frame]
     left = np.where(
-        problem.known[seen.point],
-        np.maximum(1 - 3 / in_frame, LEAST_REDUNDANCY),
-        left_by_point(weight, of_track),
+        problem.known[seen.point], left_by_frame(in_frame), left_by_point(weight, of_track)
     )
     result: FloatArray = left * redundancy(problem, options) / float(left.mean())
     return result
@@ -100,6 +98,15 @@ def residual_lengths(problem: Problem, residuals: FloatArray) -> FloatArray:
     relative = problem.observations.relative_sigma
     lengths: FloatArray = np.linalg.norm(residuals, axis=1)
     return lengths if relative is None else lengths / relative
+
+
+def left_by_frame(in_frame: IntArray) -> FloatArray:
+    """Share (n,) of a corner that its frame leaves, which takes six numbers of all that it sees.
+
+    in_frame (n,): observations of the frame of each.
+    """
+    result: FloatArray = np.maximum(1 - 3 / in_frame, LEAST_REDUNDANCY)
+    return result
 
 
 @dataclass(frozen=True)
