@@ -17,7 +17,7 @@ from graphs.clusters import Cluster
 from graphs.elimination import SINGULAR_PIVOT, NotPositiveDefiniteError
 from graphs.frames import FloatArray
 from graphs.gauge import undetermined
-from graphs.noise import left_by_point
+from graphs.noise import left_by_frame, left_by_point
 from graphs.points import follow_points, respond
 from graphs.problem import IntArray
 from graphs.system import System
@@ -109,6 +109,7 @@ class SharedErrors:
         self.before_fit = np.zeros((n, n))
         self.of_corners = np.zeros((n, n))
         self.alone = 0.0  # sum of squares of all
+        self.before_frames = 0.0  # the same, had frames not been fitted to their few corners
 
     def add(
         self,
@@ -117,8 +118,10 @@ class SharedErrors:
         cell: IntArray,
         weight: FloatArray,
         corner: IntArray | None = None,
+        left: FloatArray | float = 1.0,
     ) -> None:
-        """`frame`, `cell`, `weight`, `corner` (n_obs,): of each observation."""
+        """`frame`, `cell`, `weight`, `corner`, `left` (n_obs,): of each observation; the last of
+        corners alone, the share that their frames leave."""
         moved = influence.moved
         np.add.at(self.by_frame, frame, moved)
         np.add.at(self.by_cell, cell, moved)
@@ -127,7 +130,9 @@ class SharedErrors:
         if corner is not None:
             np.add.at(self.by_corner, corner, moved)
             self.of_corners += moved.T @ moved
+            self.before_frames += float((squares / left).sum())
             return
+        self.before_frames += float(squares.sum())
         of_tracks = np.add.reduceat(moved, influence.begins)
         self.by_track += of_tracks.T @ of_tracks
         self.n_tracks += len(of_tracks)
@@ -145,6 +150,7 @@ class SharedErrors:
         self.before_fit += other.before_fit
         self.of_corners += other.of_corners
         self.alone += other.alone
+        self.before_frames += other.before_frames
 
 
 def shared_errors(
@@ -159,6 +165,8 @@ def shared_errors(
     board = graph.problem.board
     n_corners = 0 if board is None else len(board.board.corners)
     sizes = np.array([camera.size for camera in cameras])
+    order = graph.layout.elimination.order
+    in_frame = np.bincount(graph.problem.observations.frame, minlength=len(order))
 
     def run(cluster: Cluster) -> SharedErrors:
         sums = SharedErrors(len(cluster.frames), len(cameras), n, n_corners)
@@ -168,7 +176,8 @@ def shared_errors(
             x, y = np.clip((inside * CELLS).astype(np.int64), 0, CELLS - 1).T
             weight = cluster.root_information[observation] ** 2
             corner = None if cluster.corner is None else cluster.corner[point]
-            sums.add(influence, frame, (camera * CELLS + y) * CELLS + x, weight, corner)
+            left = left_by_frame(in_frame[order[cluster.frames[frame]]])
+            sums.add(influence, frame, (camera * CELLS + y) * CELLS + x, weight, corner, left)
         return sums
 
     total = SharedErrors(len(graph.problem.frame_names), len(cameras), n, n_corners)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graphs.build import CalibrationGraph, build
 from graphs.frames import FloatArray, log_rotation
 from graphs.model_covariance import ModelCovariance, model_covariance
-from graphs.problem import Estimate, IntArray, KnownPath, KnownSpan, Problem
+from graphs.problem import BoardPoints, Estimate, IntArray, KnownPath, KnownSpan, Problem
 from graphs.selection import select_tracks
 from graphs.solve import solve
 from graphs.unit import unit_jacobian
@@ -67,17 +67,8 @@ def blocks_of(problem: Problem, most: int = BLOCKS) -> IntArray:
     if of_board.any() and not of_board.all():  # each block takes its share of both kinds
         for kind in (of_board, ~of_board):
             place[kind] = (np.arange(kind.sum()) + 0.5) / kind.sum()
-    block: IntArray = (place * count).astype(np.int64)
+    block: IntArray = np.unique((place * count).astype(np.int64), return_inverse=True)[1]
     return block
-
-
-def second_half(problem: Problem) -> NDArray[np.bool_]:
-    """Frames (n_frames,) of every second block; of a board beside a scan, every second one."""
-    second: NDArray[np.bool_] = blocks_of(problem) % 2 == 1
-    of_board = problem.board_frames
-    if of_board.any() and not of_board.all():
-        second[of_board] = np.arange(of_board.sum()) % 2 == 1
-    return second
 
 
 def delete_group_jackknife(
@@ -124,18 +115,23 @@ def solve_part(
 ) -> tuple[FloatArray, ModelCovariance] | None:
     """How far the calibration (n,) moves with these frames (n_frames,) alone, and its covariance.
 
-    Both in the unit of `model`. Frames that give the unit stay: the ends of measured paths, and
-    all with clicks. None where these frames do not determine the calibration.
+    Both in the unit of `model`. Frames that give the unit stay: the ends of measured paths, all
+    with clicks, and those with a board where no other frame has one. None where these frames do not
+    determine the calibration.
     """
     problem = graph.problem
     seen = problem.observations
-    keep = frames[seen.frame] | np.isin(seen.frame, _of_scale(problem))
+    of_unit = np.union1d(_of_scale(problem), _of_lost_scale(problem, frames))
+    keep = frames[seen.frame] | np.isin(seen.frame, of_unit)
     try:
         rest = select_tracks(
             replace(problem, initial=estimate, observations=seen.subset(keep)), min_parallax_deg
         )
-        if rest.metric != problem.metric:  # without what gives metres: another unit
+        if rest.metric != problem.metric or _of_board_alone(rest) != _of_board_alone(problem):
             return None
+        if rest.board is None and problem.board is not None:  # what is known of it is a prior still
+            scene = np.zeros(len(rest.initial.points), dtype=bool)
+            rest = replace(rest, board=BoardPoints(problem.board.board, scene - 1, scene))
         part = build(rest, graph.options)
         found, values, summary = solve(part, STEPS, TOLERANCE, near=True)
         if not summary.converged:
@@ -176,6 +172,23 @@ def _of_scale(problem: Problem) -> IntArray:
     if len(with_board) == 1:
         kept.append(with_board)
     return np.unique(np.concatenate(kept))
+
+
+def _of_lost_scale(problem: Problem, frames: NDArray[np.bool_]) -> IntArray:
+    """Frames that have a scan in the board's unit, where none of `frames` (n_frames,) is one.
+
+    Without them the size would be held where it is, and seem to be known.
+    """
+    part = replace(
+        problem, observations=problem.observations.subset(frames[problem.observations.frame])
+    )
+    if part.metric or _of_board_alone(problem):  # without a scan that fails, and is said
+        return np.empty(0, np.int64)
+    return problem.frames_of_scale
+
+
+def _of_board_alone(problem: Problem) -> bool:
+    return bool(problem.board_frames.all())
 
 
 def change(estimate: Estimate, other: Estimate, names: tuple[str, ...]) -> FloatArray:

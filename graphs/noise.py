@@ -131,6 +131,15 @@ def residual_lengths(problem: Problem, residuals: FloatArray) -> FloatArray:
     return lengths if relative is None else lengths / relative
 
 
+def left_by_frame(in_frame: IntArray) -> FloatArray:
+    """Share (n,) of a corner that its frame leaves, which takes six numbers of all that it sees.
+
+    in_frame (n,): observations of the frame of each.
+    """
+    result: FloatArray = np.maximum(1 - 3 / in_frame, LEAST_REDUNDANCY)
+    return result
+
+
 @dataclass(frozen=True)
 class NoiseClass:
     """Observations of one camera whose keypoints are about equally large, and their noise."""

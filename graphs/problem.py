@@ -180,15 +180,24 @@ class Problem:
 
     @property
     def board_gives_scale(self) -> bool:
-        """Whether two cameras see the board at once, or it stands in the scene itself."""
+        """Whether images that the scene or the rig links see the board where it is."""
+        return len(self.frames_of_scale) > 0
+
+    @property
+    def frames_of_scale(self) -> IntArray:
+        """Frames in which two cameras see the board at once, or it stands in the scene itself.
+
+        Of a board that stands, one image places it alone: it takes two to tell a length.
+        """
         if self.board is None:
-            return False
+            return np.empty(0, np.int64)
         seen = self.observations
-        rows = self.board.known[seen.point]
-        if self.board.still[seen.point[rows]].any():
-            return True
-        images = np.unique(np.stack([seen.frame[rows], seen.camera[rows]], axis=1), axis=0)
-        return len(np.unique(images[:, 0])) < len(images)
+        still = self.board.still[seen.point]
+        stood = images_seen(seen.subset(still))[:, 1]
+        both = images_seen(seen.subset(self.board.known[seen.point] & ~still))[:, 1]
+        frames, count = np.unique(both, return_counts=True)
+        at_once: IntArray = frames[count > 1]
+        return np.union1d(at_once, stood) if len(stood) > 1 else at_once
 
 
 def points_in_cameras(estimate: Estimate, observations: Observations) -> FloatArray:

@@ -63,6 +63,7 @@ def compact(problem: Problem, observations: Observations) -> Problem:
     """
     start = problem.initial
     points, point = np.unique(observations.point, return_inverse=True)
+    board = _board_of(problem, points)
     frames, frame = np.unique(observations.frame, return_inverse=True)
     return replace(
         problem,
@@ -70,11 +71,12 @@ def compact(problem: Problem, observations: Observations) -> Problem:
             start,
             rig_from_world=tuple(start.rig_from_world[f] for f in frames),
             points=start.points[points],
+            world_from_board=start.world_from_board if board and board.still.any() else None,
         ),
         observations=replace(observations, point=point, frame=frame),
         frame_names=tuple(problem.frame_names[f] for f in frames),
         scales=tuple(_renumbered(problem, one, frames, points) for one in problem.scales),
-        board=_board_of(problem, points),
+        board=board,
     )
 
 

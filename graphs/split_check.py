@@ -13,7 +13,7 @@ import numpy as np
 from graphs.build import CalibrationGraph
 from graphs.frames import FloatArray
 from graphs.image_grid import image_grid, typical_distances
-from graphs.jackknife import second_half, solve_part
+from graphs.jackknife import blocks_of, solve_part
 from graphs.model_covariance import ModelCovariance
 from graphs.problem import Estimate
 from graphs.stated_covariance import CalibrationCovariance, factors
@@ -51,7 +51,7 @@ def split_check(
     """
     if not covariance.basis.names:
         return None
-    model, second = covariance.basis, second_half(graph.problem)
+    model, second = covariance.basis, blocks_of(graph.problem) % 2 == 1
     halves = [
         solve_part(graph, estimate, model, frames, min_parallax_deg) for frames in (~second, second)
     ]

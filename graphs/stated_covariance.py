@@ -132,21 +132,30 @@ def _of_frames(shared: SharedErrors) -> FloatArray:
     seen = shared.by_frame[shared.by_frame.any(axis=1)]
     if len(seen) < MIN_FRAMES:
         return np.zeros_like(shared.by_track)
-    return _excess(seen.T @ seen, len(seen), shared.alone)
+    # What moves a frame moves nothing else: the sum over it is free of its fit.
+    return _excess(seen.T @ seen, len(seen), shared.before_frames)
 
 
 def _of_tracks(shared: SharedErrors) -> FloatArray:
     # What moves a track's point moves nothing else: the sum over a track is free of its fit, and
     # to be compared with residuals that are.
     if len(shared.by_corner):
-        return _excess_of_part(shared.by_track, shared.n_tracks, shared.before_fit, shared.alone)
+        return _excess_of_part(
+            shared.by_track, shared.n_tracks, shared.before_fit, _before_fits(shared)
+        )
     return _excess(shared.by_track, shared.n_tracks, float(np.trace(shared.before_fit)))
 
 
 def _of_corners(shared: SharedErrors) -> FloatArray:
     """What corners of the board err in all frames alike: printed wrongly, or found wrongly."""
     seen = shared.by_corner[shared.by_corner.any(axis=1)]
-    return _excess_of_part(seen.T @ seen, len(seen), shared.of_corners, shared.alone)
+    return _excess_of_part(seen.T @ seen, len(seen), shared.of_corners, _before_fits(shared))
+
+
+def _before_fits(shared: SharedErrors) -> float:
+    """What the scatter of all data has for a trace, points and frames not fitted to it."""
+    of_tracks = shared.alone - float(np.trace(shared.of_corners))
+    return float(np.trace(shared.before_fit)) + shared.before_frames - of_tracks
 
 
 def _of_cells(shared: SharedErrors) -> FloatArray:

@@ -1,0 +1,82 @@
+"""What frames, tracks and corners err together in problems with boards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic.boards import camera, waved
+from test_boards_parts import joint
+
+from graphs.build import GraphOptions
+from graphs.clusters import homogeneous
+from graphs.frames import Transform
+from graphs.influence import SharedErrors, shared_errors
+from graphs.model_covariance import model_covariance
+from graphs.problem import Problem
+from graphs.refine import refine
+from graphs.selection import compact
+from graphs.solve import threads
+from graphs.stated_covariance import _before_fits, _of_corners, _of_data, _of_frames, _of_tracks
+
+
+def errors_of(problem: Problem) -> tuple[SharedErrors, int]:
+    """What errs together at the optimum, and how many directions the data decide."""
+    found = refine(problem, GraphOptions(), 1.0)
+    model = model_covariance(found.graph, found.estimate, found.values)
+    whiten = _of_data(model)[1]
+    points = homogeneous(found.graph.tracks, found.estimate.points)
+    with threads() as pool:
+        variables = found.graph.variables(found.values)
+        shared = shared_errors(found.graph, variables, points, model.response @ whiten.T, pool)
+    return shared, len(whiten)
+
+
+def test_frames_that_see_few_corners_do_not_seem_to_err_together() -> None:
+    """Six numbers of each frame are fitted to twenty coordinates."""
+    ratios, of_all = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        problem, _ = waved(rng, 30, 0.2, [camera("one")], [Transform.identity()], seen=0.2)
+        shared, n = errors_of(problem)
+        frames = shared.by_frame[shared.by_frame.any(axis=1)]
+        finite = len(frames) / (len(frames) - 1)
+        ratios.append(finite * (frames**2).sum() / np.array([shared.before_frames, shared.alone]))
+        of_all.append([shared.before_frames / n, shared.alone / n])
+    # Frames of many corners say most of the lens, which takes of those more than its share.
+    assert 0.7 < np.mean(ratios, axis=0)[0] < 1.05
+    assert np.mean(ratios, axis=0)[1] > 1.2 * np.mean(ratios, axis=0)[0]  # of what is left
+    np.testing.assert_allclose(np.mean(of_all, axis=0), [0.95, 0.65], atol=0.1)
+
+
+def test_tracks_and_corners_are_held_against_all_data_before_fits() -> None:
+    """Independent errors scatter by one in each direction, whatever was fitted to them."""
+    shared, n = errors_of(joint(10, 3))
+    assert _before_fits(shared) == pytest.approx(n, rel=0.2)
+    assert shared.alone < 0.8 * n
+    for excess in (_of_frames(shared), _of_tracks(shared), _of_corners(shared)):
+        assert abs(np.trace(excess)) < 0.35 * n
+
+
+def test_a_board_that_says_nothing_leaves_the_excess_of_tracks_as_it_is() -> None:
+    rng = np.random.default_rng(7)
+    problem = joint(10, 1, 120)
+    seen = problem.observations
+    drift = 0.3 * rng.standard_normal((len(problem.initial.points), 2))
+    drifting = seen.pixels + np.where(
+        problem.known[seen.point, None], 0.0, drift[seen.point] * np.sin(seen.frame)[:, None]
+    )
+    drifting_seen = replace(seen, pixels=drifting)
+    problem = replace(problem, observations=drifting_seen)
+    alone = compact(problem, drifting_seen.subset(~problem.known[seen.point]))
+    with_a_blurred_board = replace(
+        problem,
+        observations=replace(
+            problem.observations,
+            relative_sigma=np.where(problem.known[seen.point], 300.0, 1.0),
+        ),
+    )
+    with_board, without = errors_of(with_a_blurred_board)[0], errors_of(alone)[0]
+    trace = [float(np.trace(_of_tracks(shared))) for shared in (with_board, without)]
+    assert trace[0] == pytest.approx(trace[1], rel=0.25)
