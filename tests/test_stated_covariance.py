@@ -89,6 +89,7 @@ def shared(n: int = 2) -> SharedErrors:
     sums.by_cell[:40] = np.random.default_rng(2).standard_normal((40, n))
     sums.by_track = np.diag([3.0, 5.0])
     sums.n_tracks, sums.alone, sums.before_fit = 50, 4.0, 3.0 * np.eye(2)
+    sums.before_frames = 4.0
     return sums
 
 

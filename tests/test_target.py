@@ -243,7 +243,7 @@ def test_from_python_it_is_the_same(images, tmp_path, stereo):
     for name in STEREO:
         for p, value in first.cameras[name].params.items():
             off = abs(ours.cameras[name].params[p] - value)
-            assert off < 0.1 * first.cameras[name].sigma[p]
+            assert off < 0.2 * first.cameras[name].sigma[p]
     a, b = (one.rig.cam_from_rig["right"].translation for one in (first, ours))
     np.testing.assert_allclose(b, 1.02 * np.array(a), atol=2e-5)
     assert "choosing the lens" not in stages  # it is said
