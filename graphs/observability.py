@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphs.build import CalibrationGraph
-from graphs.camera import focal_on_axis
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, reported_from_tangent
 from graphs.image_grid import ImageGrid, centre, corners, image_grid, typical_distances
@@ -24,6 +23,7 @@ from graphs.motion import in_words as motion_in_words
 from graphs.problem import Estimate, IntArray
 from graphs.propagation import lens_names, pose_names
 from graphs.remedies import NO_MOTION, Kind, Move, board_remedy, classify, in_words, remedy
+from graphs.usable import unseen_in_words, unusable
 
 # One stated sigma along a weak direction: about what a single feature is uncertain by. Simulated
 # rigs in hand stay at 0.2 px (three cameras, 40 frames) to 0.49 px (one camera); real scans from
@@ -35,11 +35,6 @@ WEAK_PX = 0.5
 NAMED_SHARE, NAMED_PX, EXPLAINED = 0.3, 0.1, 0.5
 MOST_LINES = 10  # a rig of many cameras: directions of one kind are told as one
 BELIEF_ALONE = 1.0 - 1e-6  # share of priors from which data alone say nothing
-# A focal length of 2 % makes depth 2 % wrong; the worst real scan states 1.1 %.
-USABLE_FOCAL_SIGMA = 0.02
-# Of any pixel's ray, rms over the image, once the rig turned as suits best: the worst real scan
-# states 0.15 deg, degenerate simulated ones 0.5 deg (two cameras straight on) to 100 deg.
-USABLE_RAY_SIGMA_DEG = 0.3
 
 
 @dataclass(frozen=True)
@@ -80,7 +75,8 @@ def observe(
     views = views_of(replace(graph.problem, initial=estimate))
     by_board = bool(graph.problem.board_frames.all())
     reported = estimate.scaled(1 / unit)
-    distances = typical_distances(reported, graph.problem.observations).tolist()
+    seen = graph.problem.observations
+    distances = typical_distances(reported, seen).tolist()
     priors = prior_information(graph, estimate, stated.names, unit)
     weak = weak_directions(reported, stated, model, priors, distances, views, by_board)
     # A rig that only drives straight may have learned all there is; one that stands still has not.
@@ -88,8 +84,11 @@ def observe(
     told = of_board_in_words if by_board else motion_in_words
     return Observability(
         weak=weak,
-        unusable=unusable(reported, stated, distances),
-        lacks=tuple(dict.fromkeys(told(lack, views) for lack in lacks)),
+        unusable=unusable(reported, stated, distances, seen),
+        lacks=(
+            *dict.fromkeys(told(lack, views) for lack in lacks),
+            *unseen_in_words(reported, stated, distances, seen),
+        ),
         prior_shares=prior_shares(model, priors),
     )
 
@@ -172,51 +171,6 @@ def prior_shares(model: Covariance, prior_information: FloatArray) -> dict[str, 
     of_prior = np.diag(model.matrix @ prior_information @ model.matrix)
     share = np.clip(of_prior / np.maximum(whole, 1e-300), 0, 1)
     return dict(zip(model.names, share.tolist(), strict=True))
-
-
-def ray_sigmas_deg(
-    estimate: Estimate, stated: Covariance, distances: Sequence[float]
-) -> tuple[float, ...]:
-    """How far off any pixel's ray is by the stated covariance, a camera each, in degrees.
-
-    Rms over its image, once the whole rig turned as suits best.
-    """
-    if not stated.names:
-        return (0.0,) * len(estimate.cameras)
-    grid = image_grid(estimate, stated.names, distances)
-    settled = grid.settled
-    variance = np.einsum("nij,jk,nik->n", settled, stated.matrix, settled)
-    px = (
-        np.sqrt(max(variance[grid.camera == i].mean(), 0.0)) for i in range(len(estimate.cameras))
-    )
-    focal = (float(np.mean(focal_on_axis(camera))) for camera in estimate.cameras)
-    return tuple(float(np.degrees(s / f)) for s, f in zip(px, focal, strict=True))
-
-
-def unusable(estimate: Estimate, stated: Covariance, distances: Sequence[float]) -> tuple[str, ...]:
-    """Why the numbers are too uncertain to use, in words; empty where they are not.
-
-    Judged is what an application meets: the focal length, and where rays point. A principal point
-    that only a prior knows is no reason, as long as rays are right: tilt makes up for it.
-    """
-    reasons, sigma = [], stated.sigma
-    for camera in estimate.cameras:
-        for name, value in zip(("fx", "fy"), camera.params[:2], strict=True):
-            relative = sigma.get(f"{camera.name}.{name}", 0.0) / value
-            if not relative <= USABLE_FOCAL_SIGMA:
-                reasons.append(
-                    f"the sigma of {camera.name}.{name} is {relative:.1%} of it (usable up to "
-                    f"{USABLE_FOCAL_SIGMA:.0%})"
-                )
-    for camera, ray in zip(
-        estimate.cameras, ray_sigmas_deg(estimate, stated, distances), strict=True
-    ):
-        if not ray <= USABLE_RAY_SIGMA_DEG:
-            reasons.append(
-                f"rays of {camera.name} are uncertain by {ray:.2g} deg (rms over the image; usable "
-                f"up to {USABLE_RAY_SIGMA_DEG:g} deg)"
-            )
-    return tuple(reasons)
 
 
 def own_px(grid: ImageGrid) -> FloatArray:

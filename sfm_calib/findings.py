@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from graphs.observability import USABLE_FOCAL_SIGMA
+from graphs.usable import USABLE_FOCAL_SIGMA
 from sfm_calib.images import Scan
 from sfm_calib.record import Record
 from sfm_calib.result import Calibration, CameraResult

@@ -24,8 +24,6 @@ from graphs.observability import (
     own_px,
     prior_information,
     prior_shares,
-    ray_sigmas_deg,
-    unusable,
     weak_directions,
 )
 from graphs.priors import RigPrior, stated_lens_prior, weak_lens_prior
@@ -33,6 +31,7 @@ from graphs.problem import Problem
 from graphs.propagation import lens_names, pose_names
 from graphs.refine import refine
 from graphs.remedies import Kind
+from graphs.usable import ray_sigmas_deg, unusable
 from sfm_calib.simulate.rigs import RigName, TrajectoryName
 from sfm_calib.simulate.scenes import SceneName
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
