@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic.anchors import (
     BOARD,
-    SIGMA_PX,
+    N_FRAMES,
+    NAMES,
     Anchored,
     board_views,
+    outcome_of,
     places_before,
+    solved_scan,
     standing_before,
     turned_half,
 )
-from synthetic.problems import small_problem
-from synthetic.scans import silent
 
 from graphs.board_join import place_boards, still_board
 from graphs.build import GraphOptions
@@ -29,24 +29,11 @@ from graphs.stated_covariance import CalibrationCovariance, calibration_covarian
 from sfm_calib.anchors import OWN_FRAME, SeenBoards, anchored
 from sfm_calib.board_use import BoardUse
 from sfm_calib.boards.views import BoardViews
-from sfm_calib.calibrate import Outcome, Stopwatch, determine
-from sfm_calib.config import RigConfig
-from sfm_calib.images import Scan
-from sfm_calib.mapping import Mapped
-from sfm_calib.run import Given
-
-N_FRAMES, UNIT_M = 8, 2.5
-NAMES = tuple(f"{frame:06d}" for frame in range(N_FRAMES))
 
 
 @pytest.fixture(scope="module")
 def scan() -> Anchored:
-    """Eight frames of two cameras past points, in units of 2.5 m, as mapping may have it."""
-    problem, truth = small_problem(
-        "radial", cameras=2, frames=N_FRAMES, points=120, sigma_px=SIGMA_PX, start_error=0.0
-    )
-    problem = replace(problem, initial=problem.initial.scaled(1 / UNIT_M))
-    return Anchored(refine(problem, GraphOptions(), 1.0), truth, UNIT_M)
+    return solved_scan()
 
 
 def nowhere(scan: Anchored) -> BoardViews:
@@ -269,20 +256,6 @@ def test_one_frame_shows_nothing(scan):
 
 
 # ---- what the board brought ----------------------------------------------------------------
-
-
-def outcome_of(scan: Anchored, problem: Problem, use: BoardUse) -> Outcome:
-    cameras = tuple(lens.name for lens in scan.truth.cameras)
-    sizes = tuple(lens.size for lens in scan.truth.cameras)
-    given = Given(
-        Scan(Path(), cameras, sizes, NAMES, ()),
-        RigConfig(lens="radial"),
-        Mapped(problem, use.messages, {}),
-        "",
-        use,
-        scan.alone.problem,
-    )
-    return determine(given, problem, Stopwatch(), silent)
 
 
 def test_the_result_says_what_the_scan_alone_does(scan):

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from graphs.build import GraphOptions
 from graphs.camera import project
 from graphs.frames import FloatArray, Transform
-from graphs.problem import Estimate
-from graphs.refine import Refinement
+from graphs.problem import Estimate, Problem
+from graphs.refine import Refinement, refine
+from sfm_calib.board_use import BoardUse
 from sfm_calib.boards.spec import Board, Checkerboard
 from sfm_calib.boards.views import BoardView, BoardViews
+from sfm_calib.calibrate import Outcome, Stopwatch, determine
+from sfm_calib.config import RigConfig
+from sfm_calib.images import Scan
+from sfm_calib.mapping import Mapped
+from sfm_calib.run import Given
+from synthetic.problems import small_problem
+from synthetic.scans import silent
 
 SIGMA_PX = 0.2
+N_FRAMES, UNIT_M = 8, 2.5
+NAMES = tuple(f"{frame:06d}" for frame in range(N_FRAMES))
 # Metres ahead of a rig whose points are 3 to 7 m away; half a turn shows it the same.
 BOARD = Checkerboard(inner_corners=(8, 6), square_m=0.2, warp=False)
 FEWEST = 12  # corners of a view: fewer are at the image's edge
@@ -26,7 +39,31 @@ class Anchored:
 
     alone: Refinement
     truth: Estimate
-    unit_m: float  # of the scan
+
+
+@functools.cache
+def solved_scan() -> Anchored:
+    """Eight frames of two cameras past points, in units of 2.5 m, as mapping may have it."""
+    problem, truth = small_problem(
+        "radial", cameras=2, frames=N_FRAMES, points=120, sigma_px=SIGMA_PX, start_error=0.0
+    )
+    problem = replace(problem, initial=problem.initial.scaled(1 / UNIT_M))
+    return Anchored(refine(problem, GraphOptions(), 1.0), truth)
+
+
+def outcome_of(scan: Anchored, problem: Problem, use: BoardUse) -> Outcome:
+    """The result of a scan that a board has joined."""
+    cameras = tuple(lens.name for lens in scan.truth.cameras)
+    sizes = tuple(lens.size for lens in scan.truth.cameras)
+    given = Given(
+        Scan(Path(), cameras, sizes, NAMES, ()),
+        RigConfig(lens="radial"),
+        Mapped(problem, use.messages, {}),
+        "",
+        use,
+        scan.alone.problem,
+    )
+    return determine(given, problem, Stopwatch(), silent)
 
 
 def board_view(
