@@ -1,0 +1,192 @@
+"""What is said of a board: how well its shape is known, its figures, and its row in the ledger."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from synthetic.anchors import BOARD, board_views, outcome_of, places_before, solved_scan
+from synthetic.boards import flat_board, stereo, waved
+from test_result import rig
+
+from graphs.board_shape import shape_sigmas
+from graphs.build import GraphOptions, build
+from graphs.factors import factor_graph
+from graphs.frames import FloatArray
+from graphs.keys import shape_key
+from graphs.noise import loss_moments
+from graphs.problem import Estimate, KnownBaseline, Problem, residuals_px
+from graphs.refine import refine
+from graphs.solve import solve
+from sfm_calib.anchors import SeenBoards, anchored
+from sfm_calib.board_record import BoardResult, Without
+from sfm_calib.report.board import board_lines, board_section, corners_figure, gains, outline
+from sfm_calib.result import Calibration, Noise, Sigmas
+
+SIGMA_PX = 0.3
+BEND = 2e-4  # m; noise alone would leave about as much
+
+# ---- how well the shape is known -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_cameras", [1, 2])
+def test_gtsam_has_the_same_marginals_of_the_shape(n_cameras):
+    """Of the data's part, what noise alone would leave; of the priors', all."""
+    cameras, cam_from_rig = (some[:n_cameras] for some in stereo())
+    board = flat_board((1e-3, BEND, BEND))
+    rng = np.random.default_rng(0)
+    problem, _ = waved(rng, 5, SIGMA_PX, cameras, cam_from_rig, board)
+    graph = build(problem, GraphOptions(SIGMA_PX, "none", np.inf))
+    estimate, values, _ = solve(graph)
+    theirs = gtsam.Marginals(factor_graph(graph), values).marginalCovariance(shape_key())
+    moments = loss_moments(problem, graph.options, residuals_px(estimate, problem.observations))
+    share = moments.score_variance / moments.curvature**2
+    priors, once, twice = (shape_sigmas(graph, estimate, values, x) ** 2 for x in (0, 1, 2))
+    np.testing.assert_allclose(twice - priors, 4 * (once - priors), rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(priors + (once - priors) / share, np.diag(theirs), rtol=1e-3)
+    assert priors[0] == pytest.approx(1e-6, rel=1e-3)  # nothing else tells how large it is
+    assert 0.2 * BEND < once[1] ** 0.5 < 0.95 * BEND  # priors and data both count
+
+
+def test_errors_of_the_shape_are_as_large_as_it_is_said():
+    """20 boards bent by chance, size and bends: mean square 1 of 60, to 4 sigmas of that."""
+    board, rng, z = flat_board((1e-3, BEND, BEND)), np.random.default_rng(5), []
+    for _ in range(20):
+        true = board.shape_sigma * rng.standard_normal(3)
+        problem, _ = waved(rng, 4, SIGMA_PX, board=board, shape=true.tolist())
+        found = refine(problem, GraphOptions(), 1.0)
+        sigma = shape_sigmas(found.graph, found.estimate, found.values)
+        assert found.estimate.board_shape is not None
+        z.append((found.estimate.board_shape - true) / sigma)
+    assert np.mean(np.square(z)) == pytest.approx(1, abs=4 * (2 / 60) ** 0.5)
+
+
+# ---- the report ----------------------------------------------------------------------------
+
+
+def test_the_outline_is_what_a_band_around_the_points_is():
+    inner = np.random.default_rng(0).uniform(1, 3, (50, 2))
+    square = np.array([[0.0, 0], [4, 0], [4, 4], [0, 4]])
+    along = np.array([[2.0, 0], [4, 1]])  # on its edges
+    found = outline(np.concatenate([inner, square, along]))
+    np.testing.assert_array_equal(found[0], found[-1])
+    assert sorted(map(tuple, found[:-1].tolist())) == sorted(map(tuple, square.tolist()))
+    x, y = found.T
+    assert abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2 == 16
+
+
+def arrows(problem: Problem, truth: Estimate) -> tuple[FloatArray, FloatArray, float]:
+    """Where the arrows start (n, 2), where they end, and their factor."""
+    figure, factor = corners_figure(problem, truth)
+    lines = np.column_stack([figure.data[0].x, figure.data[0].y]).astype(float)
+    ends = lines[np.isfinite(lines[:, 0])].reshape(-1, 2, 2)
+    return ends[:, 0], ends[:, 1], factor
+
+
+def test_arrows_point_where_residuals_do():
+    problem, truth = waved(np.random.default_rng(1), 6, 0.0)
+    assert problem.board is not None
+    seen, corner = problem.observations, 10
+    own = problem.board.corner[seen.point] == corner
+    shifted = seen.pixels - own[:, None] * np.array([0.5, -0.25])  # projected less observed
+    problem = replace(problem, observations=replace(seen, pixels=shifted))
+    start, end, factor = arrows(problem, truth)
+    np.testing.assert_allclose(start, 1e3 * problem.board.board.corners[:, :2], atol=1e-3)
+    moved = (end - start) / factor
+    np.testing.assert_allclose(moved[corner], [0.5, -0.25], rtol=1e-3)
+    rest = np.delete(moved, corner, axis=0)
+    assert np.abs(rest).max() < 1e-3
+    # of 48 arrows one is not zero: the typical one is a seventh of it
+    assert 0.02 < np.linalg.norm(end[corner] - start[corner]) / 48**0.5 / 210 < 0.08
+
+
+def test_a_corner_seen_hardly_has_no_arrow():
+    problem, truth = waved(np.random.default_rng(1), 2, 0.3, stereo()[0][:1], stereo()[1][:1])
+    start, end, _ = arrows(problem, truth)
+    np.testing.assert_array_equal(start, end)
+
+
+def with_board(**changes: object) -> Calibration:
+    board = BoardResult(
+        description="a checkerboard", n_images={"left": 4, "right": 0},
+        n_corners={"left": 160, "right": 0}, sigma_px={"left": 0.05},
+    ).model_copy(update=changes)  # fmt: skip
+    names = ("left.fx", "right.rotation_x", "right.translation_y")
+    sigmas = {n: Sigmas(model=0.0, robust=0.0, jackknife=None, stated=0.01) for n in names}
+    noise = Noise(sigma_px=0.3, inflation=1.0, sigmas=sigmas, by_size={})
+    return rig().model_copy(update={"board": board, "noise": noise})
+
+
+def test_gains_are_told_in_degrees_and_not_without_a_metre():
+    without = {
+        "left.fx": Without(sigma=0.025, moved=-0.5),
+        "right.rotation_x": Without(sigma=0.02, moved=0.01),
+        "right.translation_y": Without(sigma=None, moved=None),
+        "left.gone": Without(sigma=1.0, moved=0.0),
+    }
+    focal, turn, move = gains(with_board(without=without))
+    assert (focal.name, focal.alone, focal.joint) == ("left.fx", "0.025", "0.010")
+    assert focal.gain == "2.5 x" and float(focal.moved) == -0.5
+    assert turn.name == "right.rotation_x (deg)" and turn.gain == "2.0 x"
+    assert float(turn.alone) == pytest.approx(np.degrees(0.02), rel=0.05)
+    assert float(turn.joint) == pytest.approx(np.degrees(0.01), rel=0.05)
+    assert float(turn.moved) == pytest.approx(np.degrees(0.01), rel=0.05)
+    assert (move.alone, move.gain, move.moved) == ("no metre", "", "")
+    assert gains(with_board()) == () and gains(rig()) == ()
+
+
+def test_lines_tell_what_was_seen_and_a_bend_that_is_noticed():
+    (seen,) = board_lines(with_board().board)
+    assert seen == "board: a checkerboard, in images of its own: left 4 images with 160 corners " \
+        "(0.050 px)"  # fmt: skip
+    bent = with_board(bend_mm=(1.5, 0.1), sigma_bend_mm=(0.2, 0.2), in_scan="still").board
+    first, second = board_lines(bent)
+    assert "standing in the scan" in first
+    assert second == "the board is bent by 1.5 +- 0.2 mm between left and right"
+    flat = with_board(bend_mm=(0.3, 0.1), sigma_bend_mm=(0.2, 0.1)).board
+    assert board_lines(flat)[1:] == ["the board is flat to 0.20 mm"]
+    larger = with_board(size=1.01, sigma_size=0.001).board
+    assert board_lines(larger)[1:] == ["the board is +1.00 +- 0.10 % larger than stated"]
+
+
+def test_there_is_a_panel_of_each_camera_that_saw_it():
+    problem, truth = waved(np.random.default_rng(1), 4, 0.1)
+    section = board_section(with_board(left_out=("left/1: blurred",)), problem, truth)
+    assert section is not None and section.left_out == ("left/1: blurred",)
+    assert [panel.title for panel in section.panels] == ["What corners share", "Views of left"]
+    assert board_section(rig(), problem, truth) is None
+
+
+# ---- the ledger ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "agree"), [(1.0, True), (1.03, False)])
+def test_a_board_stands_beside_other_lengths(factor, agree):
+    scan = solved_scan()
+    views = board_views(scan.truth, places_before(8, np.random.default_rng(1)), "abcdefgh")
+    nothing = board_views(scan.truth, {}, ())
+    problem, use = anchored(scan.alone, BOARD, SeenBoards(nothing, views, ()))
+    true_m = float(np.linalg.norm(scan.truth.cam_from_rig[1].translation))
+    tape = KnownBaseline((0, 1), factor * true_m, 1e-3 * true_m)
+    calibration = outcome_of(scan, replace(problem, scales=(tape,)), use).calibration
+    scale = calibration.rig.scale
+    assert [one.what for one in scale.ledger] == [
+        "baseline cam0 to cam1", "square of the board (200 mm)",
+    ]  # fmt: skip
+    baseline, square = scale.ledger
+    assert scale.contradicted is not agree and baseline.contradicts is not agree
+    said = [one for one in calibration.verdict.messages if "contradict" in one]
+    assert baseline.predicted_by_others_m == pytest.approx(
+        true_m, abs=4 * baseline.sigma_predicted_m
+    )
+    assert square.predicted_by_others_m == pytest.approx(
+        factor * 0.2, abs=4 * square.sigma_predicted_m
+    )
+    if agree:
+        assert said == []
+    else:
+        (line,) = said
+        assert "baseline cam0 to cam1 of" in line and "square of the board (200 mm) of" in line
+        assert "measure both again" in line
