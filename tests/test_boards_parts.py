@@ -12,13 +12,20 @@ from test_boards_graph import still_board
 
 from graphs.board_problem import beside
 from graphs.build import GraphOptions, build
+from graphs.gauge import _name
+from graphs.held_out import held_out_costs
 from graphs.jackknife import blocks_of, solve_part
-from graphs.problem import Problem
+from graphs.keys import board_key, shape_key
+from graphs.model_covariance import model_covariance
+from graphs.problem import KnownBaseline, Problem
 from graphs.refine import refine
 from graphs.selection import compact
 from graphs.solve import solve
 from graphs.split_check import split_check
 from graphs.stated_covariance import calibration_covariance
+
+METRE = KnownBaseline((0, 1), 0.2, 1e-3)
+KEYS = {"size": shape_key(), "place": board_key()}
 
 
 def joint(n_scan: int, n_boards: int, n_points: int = 60) -> Problem:
@@ -116,3 +123,35 @@ def test_one_image_of_a_board_that_stands_gives_no_metre() -> None:
     found = refine(one, GraphOptions(), 1.0)
     covariance = calibration_covariance(found.graph, found.estimate, found.values)
     assert covariance.basis.unit_camera == 1
+
+
+@pytest.mark.parametrize("which", ["still", "waved"])
+def test_frames_held_out_see_the_board_where_the_others_have_it(which: str) -> None:
+    """Not where their own corners were when all frames were solved for."""
+    if which == "still":
+        problem, _ = still_board()
+    else:
+        problem, _ = waved(np.random.default_rng(3), 6, 0.2)
+    found = refine(problem, GraphOptions(), 1.0)
+    solved, options = replace(found.problem, initial=found.estimate), found.graph.options
+    elsewhere = found.estimate.points + np.where(solved.known[:, None], [0.002, 0.0, 0.004], 0.0)
+    moved = replace(solved, initial=replace(found.estimate, points=elsewhere))
+    costs, others = held_out_costs(solved, options, 3), held_out_costs(moved, options, 3)
+    np.testing.assert_allclose(costs, others, rtol=1e-3, atol=1e-3)
+    corners = solved.known[solved.observations.point]
+    assert np.isfinite(costs[corners]).all()
+    assert costs[corners].mean() < 1.6  # halves of squares of two coordinates: 1
+
+
+def test_what_is_undetermined_of_a_board_is_named() -> None:
+    problem, _ = still_board()
+    assert problem.board is not None
+    seen = problem.observations
+    scene = problem.observations.subset(~problem.known[seen.point])
+    graph = build(replace(problem, observations=scene, scales=(METRE,)), GraphOptions())
+    with pytest.raises(ValueError, match="of the board in the scene"):
+        model_covariance(graph, problem.initial, graph.initial)
+    place = {name: graph.layout.columns(key)[0] for name, key in KEYS.items()}
+    assert _name(problem, graph.layout, place["size"]) == "the size of the board"
+    assert _name(problem, graph.layout, place["size"] + 2) == "the bend of the board"
+    assert _name(problem, graph.layout, place["place"]) == "the rotation of the board in the scene"
