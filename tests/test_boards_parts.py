@@ -17,7 +17,7 @@ from graphs.build import GraphOptions, build
 from graphs.frames import Transform
 from graphs.gauge import _name, choose_gauge
 from graphs.held_out import held_out_costs
-from graphs.jackknife import blocks_of, solve_part
+from graphs.jackknife import _of_scale, blocks_of, solve_part
 from graphs.keys import board_key, shape_key
 from graphs.ladder import thinned
 from graphs.model_covariance import model_covariance
@@ -182,19 +182,26 @@ def test_corners_are_kept_where_one_camera_sees_enough_of_them() -> None:
 
 
 def test_no_budget_and_no_lot_takes_corners_away() -> None:
-    problem = joint(8, 2, 120)
+    problem = joint(4, 2, 250)
     known = problem.known[problem.observations.point]
     tracks, corners = np.count_nonzero(~known), np.count_nonzero(known)
     same, budget = within_budget(problem, GraphOptions(0.2), int(tracks))
     assert budget is None and same is problem  # corners are beyond the number
-    fewer, budget = within_budget(problem, GraphOptions(0.2), int(tracks) // 2)
+    fewer, budget = within_budget(problem, GraphOptions(0.2), int(corners) + 100)
     assert budget is not None and budget.available == len(known)
-    left = fewer.known[fewer.observations.point]
-    assert np.count_nonzero(left) == corners
-    assert np.count_nonzero(~left) <= tracks // 2
     thin = thinned(problem, len(known) // 3)
-    left = thin.known[thin.observations.point]
-    assert np.count_nonzero(left) == corners and np.count_nonzero(~left) < tracks
+    for part in (fewer, thin):
+        left = part.known[part.observations.point]
+        assert np.count_nonzero(left) == corners and np.count_nonzero(~left) < tracks
+
+
+def test_the_only_frame_with_a_board_is_not_left_out() -> None:
+    problem = joint(10, 1)
+    seen = problem.observations
+    problem = replace(problem, observations=seen.subset((seen.frame < 10) | (seen.camera == 0)))
+    assert not problem.metric
+    assert _of_scale(problem).tolist() == [10]
+    assert _of_scale(joint(10, 2)).size == 0
 
 
 def test_views_are_judged_by_the_board_alone_or_by_the_scene_alone() -> None:
