@@ -9,7 +9,7 @@ import numpy as np
 
 from graphs.elimination import NotPositiveDefiniteError
 from graphs.frames import NOT_SMART, Transform, to_gtsam_inverse
-from graphs.keys import frame_key, lens_key, rig_key
+from graphs.keys import board_key, frame_key, lens_key, rig_key, shape_key
 from graphs.problem import Problem
 from graphs.system import Layout, System
 
@@ -127,4 +127,8 @@ def _name(problem: Problem, layout: Layout, column: int) -> str:
     for index, name in enumerate(problem.frame_names):
         if key == frame_key(index):
             return f"the {kind} of frame {name}"
+    if key == board_key():
+        return f"the {kind} of the board in the scene"
+    if key == shape_key():
+        return "the bend of the board" if part else "the size of the board"
     return str(gtsam.DefaultKeyFormatter(key))

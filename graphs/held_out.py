@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graphs.boards import corners_of, shape_of
 from graphs.build import GraphOptions, build, root_information
 from graphs.camera import lens_arrays
 from graphs.frames import FloatArray, Transform
@@ -79,6 +80,15 @@ def _fit(problem: Problem, options: GraphOptions, train: NDArray[np.bool_]) -> E
     found = solve(build(part, options), MOST_STEPS, RELATIVE_TOLERANCE)[0]
     points = problem.initial.points.copy()
     points[np.unique(problem.observations.point[train])] = found.points
+    if part.board is not None and problem.board is not None:
+        # Of frames held out too: where the others have the board.
+        known, still = problem.board.known, problem.board.still
+        corners = corners_of(part.board.board, shape_of(found, part.board.board))[0]
+        points[known] = corners[problem.board.corner[known]]
+        if found.world_from_board is not None:
+            points[still] = found.world_from_board @ points[still]
+        else:
+            points[still] = problem.initial.points[still]
     return replace(
         problem.initial, cameras=found.cameras, cam_from_rig=found.cam_from_rig, points=points
     )

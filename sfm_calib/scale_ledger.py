@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphs.boards import shape_of
+from graphs.boards import LEAST_SIGMA, shape_of
 from graphs.keys import shape_key
 from graphs.scale_ledger import LedgerEntry, ScaleLedger, SourceRow, scale_ledger
 from sfm_calib.report.digits import decimals_for, number
@@ -35,7 +35,8 @@ def _of_board(run: Run) -> tuple[SourceRow, ...]:
     problem, estimate = run.refinement.problem, run.refinement.estimate
     if problem.board is None or run.board is None or not problem.board_gives_scale:
         return ()
-    unit_m, relative = run.board.board.unit_m, float(problem.board.board.shape_sigma[0])
+    unit_m = run.board.board.unit_m
+    relative = max(float(problem.board.board.shape_sigma[0]), LEAST_SIGMA)  # as in the graph
     grown = float(shape_of(estimate, problem.board.board)[0] - problem.board.board.shape_mean[0])
     layout = run.refinement.graph.layout
     row = np.zeros(layout.elimination.n_columns)

@@ -11,14 +11,27 @@ from synthetic.problems import small_problem
 from test_boards_graph import still_board
 
 from graphs.board_problem import beside
+from graphs.boards import corners_of
+from graphs.budget import within_budget
 from graphs.build import GraphOptions, build
-from graphs.jackknife import blocks_of, solve_part
-from graphs.problem import Problem
+from graphs.frames import Transform
+from graphs.gauge import _name, choose_gauge
+from graphs.held_out import held_out_costs
+from graphs.jackknife import _of_scale, blocks_of, solve_part
+from graphs.keys import board_key, shape_key
+from graphs.ladder import thinned
+from graphs.model_covariance import model_covariance
+from graphs.motion import views_of
+from graphs.problem import KnownBaseline, Problem, points_in_cameras, residuals_px
 from graphs.refine import refine
-from graphs.selection import compact
+from graphs.selection import compact, select_tracks
 from graphs.solve import solve
 from graphs.split_check import split_check
 from graphs.stated_covariance import calibration_covariance
+from graphs.twin import twin_problem
+
+METRE = KnownBaseline((0, 1), 0.2, 1e-3)
+KEYS = {"size": shape_key(), "place": board_key()}
 
 
 def joint(n_scan: int, n_boards: int, n_points: int = 60) -> Problem:
@@ -116,3 +129,137 @@ def test_one_image_of_a_board_that_stands_gives_no_metre() -> None:
     found = refine(one, GraphOptions(), 1.0)
     covariance = calibration_covariance(found.graph, found.estimate, found.values)
     assert covariance.basis.unit_camera == 1
+
+
+@pytest.mark.parametrize("which", ["still", "waved"])
+def test_frames_held_out_see_the_board_where_the_others_have_it(which: str) -> None:
+    """Not where their own corners were when all frames were solved for."""
+    if which == "still":
+        problem, _ = still_board()
+    else:
+        problem, _ = waved(np.random.default_rng(3), 6, 0.2)
+    found = refine(problem, GraphOptions(), 1.0)
+    solved, options = replace(found.problem, initial=found.estimate), found.graph.options
+    elsewhere = found.estimate.points + np.where(solved.known[:, None], [0.002, 0.0, 0.004], 0.0)
+    moved = replace(solved, initial=replace(found.estimate, points=elsewhere))
+    costs, others = held_out_costs(solved, options, 3), held_out_costs(moved, options, 3)
+    np.testing.assert_allclose(costs, others, rtol=1e-3, atol=1e-3)
+    corners = solved.known[solved.observations.point]
+    assert np.isfinite(costs[corners]).all()
+    assert costs[corners].mean() < 1.6  # halves of squares of two coordinates: 1
+
+
+def test_what_is_undetermined_of_a_board_is_named() -> None:
+    problem, _ = still_board()
+    assert problem.board is not None
+    seen = problem.observations
+    scene = problem.observations.subset(~problem.known[seen.point])
+    graph = build(replace(problem, observations=scene, scales=(METRE,)), GraphOptions())
+    with pytest.raises(ValueError, match="of the board in the scene"):
+        model_covariance(graph, problem.initial, graph.initial)
+    place = {name: graph.layout.columns(key)[0] for name, key in KEYS.items()}
+    assert _name(problem, graph.layout, place["size"]) == "the size of the board"
+    assert _name(problem, graph.layout, place["size"] + 2) == "the bend of the board"
+    assert _name(problem, graph.layout, place["place"]) == "the rotation of the board in the scene"
+
+
+def test_corners_are_kept_where_one_camera_sees_enough_of_them() -> None:
+    """Six of one camera place the board for all; five of each of two cameras do not."""
+    problem, _ = waved(np.random.default_rng(3), 3, 0.2)
+    seen = problem.observations
+    number = np.zeros(len(seen), np.int64)
+    for frame in range(3):
+        for index in range(2):
+            rows = np.flatnonzero((seen.frame == frame) & (seen.camera == index))
+            number[rows] = np.arange(len(rows))
+    most = np.array([[5, 5], [6, 3], [4, 6]])
+    few = replace(problem, observations=seen.subset(number < most[seen.frame, seen.camera]))
+    kept = select_tracks(few, 1.0)
+    assert kept.frame_names == problem.frame_names[1:]
+    counts = np.zeros((2, 2), np.int64)
+    np.add.at(counts, (kept.observations.frame, kept.observations.camera), 1)
+    assert counts.tolist() == [[6, 3], [4, 6]]
+
+
+def test_no_budget_and_no_lot_takes_corners_away() -> None:
+    problem = joint(4, 2, 250)
+    known = problem.known[problem.observations.point]
+    tracks, corners = np.count_nonzero(~known), np.count_nonzero(known)
+    same, budget = within_budget(problem, GraphOptions(0.2), int(tracks))
+    assert budget is None and same is problem  # corners are beyond the number
+    fewer, budget = within_budget(problem, GraphOptions(0.2), int(corners) + 100)
+    assert budget is not None and budget.available == len(known)
+    thin = thinned(problem, len(known) // 3)
+    for part in (fewer, thin):
+        left = part.known[part.observations.point]
+        assert np.count_nonzero(left) == corners and np.count_nonzero(~left) < tracks
+
+
+def test_the_only_frame_with_a_board_is_not_left_out() -> None:
+    problem = joint(10, 1)
+    seen = problem.observations
+    problem = replace(problem, observations=seen.subset((seen.frame < 10) | (seen.camera == 0)))
+    assert not problem.metric
+    assert _of_scale(problem).tolist() == [10]
+    assert _of_scale(joint(10, 2)).size == 0
+
+
+def test_views_are_judged_by_the_board_alone_or_by_the_scene_alone() -> None:
+    boards, truth = waved(np.random.default_rng(1), 12, 0.2)
+    for index, views in enumerate(views_of(boards)):
+        rows = boards.observations.camera == index
+        away = np.linalg.norm(points_in_cameras(truth, boards.observations)[rows], axis=1)
+        assert views.distance == pytest.approx(np.median(away), rel=1e-3)
+        assert views.parallax_deg > 30 and views.relief < 1e-9  # one board, seen from all sides
+    problem = joint(8, 2)
+    scan = compact(problem, problem.observations.subset(problem.observations.frame < 8))
+    for mixed, alone in zip(views_of(problem), views_of(scan), strict=True):
+        assert mixed.parallax_deg == pytest.approx(alone.parallax_deg)
+        assert mixed.distance == pytest.approx(alone.distance)
+        assert mixed.relief == pytest.approx(alone.relief)
+
+
+def test_a_scene_in_other_units_has_a_board_of_another_size() -> None:
+    problem, truth = still_board(0.0)
+    twice = truth if truth.board_shape is not None else problem.initial
+    before = residuals_px(twice, problem.observations)
+    scaled = twice.scaled(2.0)
+    assert scaled.board_shape is not None and scaled.world_from_board is not None
+    assert problem.board is not None
+    places = scaled.world_from_board @ corners_of(problem.board.board, scaled.board_shape)[0]
+    known = problem.known
+    np.testing.assert_allclose(places[problem.board.corner[known]], scaled.points[known])
+    np.testing.assert_allclose(residuals_px(scaled, problem.observations), before, atol=1e-9)
+
+
+def test_the_twins_board_is_stated_with_an_error_of_its_sigma() -> None:
+    shape = np.array([0.02, 3e-3, -2e-3])
+    sigma = np.array([4e-3, 1e-3, 0.0])
+    problem, _ = waved(np.random.default_rng(3), 6, 0.2, board=flat_board(sigma), shape=shape)
+    found = refine(replace(problem, initial=replace(problem.initial)), GraphOptions(), 1.0)
+    found = replace(found, estimate=replace(found.estimate, board_shape=shape))
+    rng = np.random.default_rng(0)
+    stated = []
+    for _ in range(200):
+        board = twin_problem(found, rng).board
+        assert board is not None
+        stated.append(board.board.shape_mean)
+    off = np.array(stated) - shape
+    assert np.abs(off.mean(0)).max() < 4 * sigma.max() / 200**0.5
+    np.testing.assert_allclose(off.std(0), sigma, rtol=0.2)
+
+
+def test_every_block_takes_its_share_of_both_kinds() -> None:
+    block = blocks_of(joint(20, 10, 30))
+    assert np.bincount(block[:20]).tolist() == [2] * 10
+    assert np.bincount(block[20:]).tolist() == [1] * 10
+
+
+def test_the_gauge_holds_frames_of_the_scene() -> None:
+    problem = joint(6, 2, 40)
+    far = Transform.exp(np.zeros(3), np.array([0.0, 0.0, 100.0]))
+    start = problem.initial
+    placed = (*start.rig_from_world[:6], *(far @ one for one in start.rig_from_world[6:]))
+    gauge = choose_gauge(replace(problem, initial=replace(start, rig_from_world=placed)))
+    assert gauge is not None and gauge.distance < 50
+    assert gauge.frame < 6 and (gauge.frames is None or max(gauge.frames) < 6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic.boards import camera, waved
+from synthetic.boards import camera, flat_board, waved
 from test_boards_parts import joint
 
 from graphs.build import GraphOptions
@@ -14,11 +14,21 @@ from graphs.clusters import homogeneous
 from graphs.frames import Transform
 from graphs.influence import SharedErrors, shared_errors
 from graphs.model_covariance import model_covariance
+from graphs.noise import free_dimensions, noise_classes, redundancies, redundancy
 from graphs.problem import Problem
 from graphs.refine import refine
 from graphs.selection import compact
 from graphs.solve import threads
-from graphs.stated_covariance import _before_fits, _of_corners, _of_data, _of_frames, _of_tracks
+from graphs.stated_covariance import (
+    _before_fits,
+    _of_cells,
+    _of_corners,
+    _of_data,
+    _of_frames,
+    _of_tracks,
+    _widened,
+    calibration_covariance,
+)
 
 
 def errors_of(problem: Problem) -> tuple[SharedErrors, int]:
@@ -80,3 +90,74 @@ def test_a_board_that_says_nothing_leaves_the_excess_of_tracks_as_it_is() -> Non
     with_board, without = errors_of(with_a_blurred_board)[0], errors_of(alone)[0]
     trace = [float(np.trace(_of_tracks(shared))) for shared in (with_board, without)]
     assert trace[0] == pytest.approx(trace[1], rel=0.25)
+
+
+def misprinted(sigma_m: float) -> Problem:
+    """Views of a board whose corners are not quite where they are said to be."""
+    rng = np.random.default_rng(5)
+    board = flat_board()
+    off = np.append(sigma_m * rng.standard_normal((48, 2)), np.zeros((48, 1)), axis=1)
+    printed = replace(board, corners=board.corners + off)
+    problem, _ = waved(rng, 25, 0.1, [camera("one")], [Transform.identity()], printed)
+    assert problem.board is not None
+    return replace(problem, board=replace(problem.board, board=board))
+
+
+def test_corners_that_are_printed_wrongly_err_together() -> None:
+    wrong, n = errors_of(misprinted(2e-4))
+    right, _ = errors_of(misprinted(0.0))
+    assert np.trace(_of_corners(wrong)) > 2 * n
+    assert abs(np.trace(_of_corners(right))) < n
+    assert len(wrong.by_corner) == 48 and wrong.by_corner.any(axis=1).all()
+
+
+def test_what_corners_share_is_added_to_the_covariance() -> None:
+    found = refine(misprinted(2e-4), GraphOptions(), 1.0)
+    covariance = calibration_covariance(found.graph, found.estimate, found.values)
+    root, whiten = _of_data(covariance.basis)
+    points = homogeneous(found.graph.tracks, found.estimate.points)
+    with threads() as pool:
+        shared = shared_errors(
+            found.graph, found.graph.variables(found.values), points,
+            covariance.basis.response @ whiten.T, pool,
+        )  # fmt: skip
+    parts = _of_frames(shared) + _of_tracks(shared) + _of_corners(shared) + _of_cells(shared)
+    expected = _widened(covariance.basis, root, parts).matrix
+    np.testing.assert_allclose(covariance.stated.matrix, expected, rtol=1e-9)
+    without = _widened(covariance.basis, root, parts - _of_corners(shared))
+    assert covariance.stated.sigma["one.fx"] > 1.1 * without.sigma["one.fx"]
+
+
+def test_numbers_that_boards_leave_to_be_determined() -> None:
+    """A board's frames have a world each, its corners are given; a scan's world is free."""
+    boards, _ = waved(np.random.default_rng(0), 12)
+    lenses_and_rig = 2 * 8 + 6
+    assert free_dimensions(boards) == lenses_and_rig + 6 * 12
+    problem = joint(10, 3)
+    scene = int((~problem.known[np.unique(problem.observations.point)]).sum())
+    assert free_dimensions(problem) == lenses_and_rig + 6 * 13 + 3 * scene - 6
+    seen = problem.observations
+    one = (seen.frame < 10) | (seen.camera == 0)
+    alone = replace(problem, observations=seen.subset(one))
+    assert free_dimensions(alone) == lenses_and_rig + 6 * 13 + 3 * scene - 7
+
+
+def test_corners_of_few_in_a_frame_are_fitted_to_more() -> None:
+    problem, _ = waved(np.random.default_rng(0), 10, seen=0.3)
+    in_frame = np.bincount(problem.observations.frame)[problem.observations.frame]
+    left = redundancies(problem)
+    np.testing.assert_allclose(left / left[0], (1 - 3 / in_frame) / (1 - 3 / in_frame[0]))
+    assert left.mean() == pytest.approx(redundancy(problem))
+
+
+def test_sizes_of_keypoints_are_no_class_of_corners() -> None:
+    problem = joint(8, 3)
+    known = problem.known[problem.observations.point]
+    size = np.where(known, np.nan, 4.0)
+    problem = replace(problem, observations=replace(problem.observations, feature_scale=size))
+    classes = noise_classes(problem, np.ones((len(known), 2)))
+    assert [(one.camera, one.of_board) for one in classes] == [
+        (0, True), (0, False), (1, True), (1, False),
+    ]  # fmt: skip
+    assert sum(one.count for one in classes if one.of_board) == known.sum()
+    assert sum(one.count for one in classes) == len(known)

@@ -88,8 +88,8 @@ def shared(n: int = 2) -> SharedErrors:
     sums.by_frame[:] = np.random.default_rng(1).standard_normal((12, n))
     sums.by_cell[:40] = np.random.default_rng(2).standard_normal((40, n))
     sums.by_track = np.diag([3.0, 5.0])
-    sums.n_tracks, sums.alone, sums.before_fit = 50, 4.0, 3.0 * np.eye(2)
-    sums.before_frames = 4.0
+    sums.n_tracks, sums.alone, sums.before_frames = 50, 4.0, 5.0
+    sums.before_fit = 3.0 * np.eye(2)
     return sums
 
 
@@ -97,7 +97,7 @@ def test_excesses_are_over_what_independent_observations_sum_to() -> None:
     sums = shared()
     frames, cells = sums.by_frame.T @ sums.by_frame, sums.by_cell.T @ sums.by_cell
     np.testing.assert_allclose(
-        _of_frames(sums), 12 / 11 * shrunk(frames, 12) / 2.0 - np.eye(2), rtol=1e-12
+        _of_frames(sums), 12 / 11 * shrunk(frames, 12) / 2.5 - np.eye(2), rtol=1e-12
     )
     np.testing.assert_allclose(
         _of_cells(sums), 40 / 39 * shrunk(cells, 40) / 2.0 - np.eye(2), rtol=1e-12
