@@ -60,6 +60,7 @@ def test_a_dense_inverse_has_the_same_sigmas_of_the_shape(loss, scale, n_cameras
     assert 0.2 * BEND < found[1] < 1.2 * BEND  # priors and data both count
 
 
+@pytest.mark.slow
 def test_errors_of_the_shape_are_as_large_as_it_is_said():
     """20 boards bent by chance, size and bends: mean square 1 of 60, to 4 sigmas of that."""
     board, rng, z = flat_board((1e-3, BEND, BEND)), np.random.default_rng(5), []
