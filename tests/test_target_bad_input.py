@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic.scans import picture
 from synthetic.targets import (
     CHARUCO,
     CHECKERBOARD,
@@ -232,9 +231,7 @@ def test_target_needs_a_board(tmp_path, capsys):
 
 def beside_a_scan(tmp_path: Path, cameras: dict[str, list] | None) -> list[str]:
     """`calibrate --board` of a scan by `left` and `right` that no mapping would place."""
-    for camera in ("left", "right"):
-        for number in range(3):
-            picture(tmp_path / "scan" / camera / f"{number}.png", size=EYE.size)
+    folder_of(tmp_path / "scan", {"left": [WALL] * 3, "right": [WALL] * 3})
     (tmp_path / "board.yaml").write_text(board_yaml(CHARUCO))
     given = ["--board", str(tmp_path / "board.yaml")]
     if cameras is not None:
