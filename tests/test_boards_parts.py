@@ -263,3 +263,12 @@ def test_the_gauge_holds_frames_of_the_scene() -> None:
     gauge = choose_gauge(replace(problem, initial=replace(start, rig_from_world=placed)))
     assert gauge is not None and gauge.distance < 50
     assert gauge.frame < 6 and (gauge.frames is None or max(gauge.frames) < 6)
+
+
+def test_a_board_cuts_each_front_in_two_at_most() -> None:
+    """Each part holds a matrix of the whole front."""
+    problem = still_board()[0]
+    graph = build(problem, GraphOptions())
+    fronts = [cluster.front for cluster in graph.tracks.clusters]
+    kinds = [cluster.corner is not None for cluster in graph.tracks.clusters]
+    assert len(fronts) == len(set(zip(fronts, kinds, strict=True))) > max(fronts) + 1
