@@ -123,8 +123,10 @@ def make_tracks(
     at = position[seen.frame]
     earliest = np.full(len(start.points), len(position))
     np.minimum.at(earliest, seen.point, at)
-    known = problem.known
-    rows = np.lexsort((seen.camera, at, seen.point, known[seen.point], earliest[seen.point]))
+    known, first_seen = problem.known, earliest[seen.point]
+    # By front, then by kind: else a front whose frames see a board falls to pieces.
+    front_of, kind = elimination.front_of[first_seen], known[seen.point]
+    rows = np.lexsort((seen.camera, at, seen.point, first_seen, kind, front_of))
     point = seen.point[rows]
     first_row = np.flatnonzero(np.diff(point, prepend=-1))
     order = point[first_row]

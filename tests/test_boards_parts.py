@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic.boards import flat_board, waved
+from synthetic.boards import camera, flat_board, waved
 from synthetic.problems import small_problem
 from test_boards_graph import still_board
 
@@ -22,6 +23,7 @@ from graphs.keys import board_key, shape_key
 from graphs.ladder import thinned
 from graphs.model_covariance import model_covariance
 from graphs.motion import views_of
+from graphs.observability import observe
 from graphs.problem import KnownBaseline, Problem, points_in_cameras, residuals_px
 from graphs.refine import refine
 from graphs.selection import compact, select_tracks
@@ -29,6 +31,7 @@ from graphs.solve import solve
 from graphs.split_check import split_check
 from graphs.stated_covariance import calibration_covariance
 from graphs.twin import twin_problem
+from sfm_calib.scale_ledger import ledger_of
 
 METRE = KnownBaseline((0, 1), 0.2, 1e-3)
 KEYS = {"size": shape_key(), "place": board_key()}
@@ -101,9 +104,9 @@ def test_what_tells_the_metre_stays_when_its_block_is_left_out() -> None:
 def test_a_board_that_no_frame_is_left_of_has_no_place() -> None:
     """Its shape is known from other views of it; a place would be determined by nothing."""
     still = still_board()[0]
-    camera = still.initial
+    rig = still.initial
     waved_too, _ = waved(
-        np.random.default_rng(1), 2, 0.2, camera.cameras, camera.cam_from_rig,
+        np.random.default_rng(1), 2, 0.2, rig.cameras, rig.cam_from_rig,
         board=still.board.board if still.board else None,
     )  # fmt: skip
     problem = beside(still, waved_too)
@@ -263,3 +266,52 @@ def test_the_gauge_holds_frames_of_the_scene() -> None:
     gauge = choose_gauge(replace(problem, initial=replace(start, rig_from_world=placed)))
     assert gauge is not None and gauge.distance < 50
     assert gauge.frame < 6 and (gauge.frames is None or max(gauge.frames) < 6)
+
+
+def test_a_board_cuts_each_front_in_two_at_most() -> None:
+    """Each part holds a matrix of the whole front."""
+    problem = still_board()[0]
+    graph = build(problem, GraphOptions())
+    fronts = [cluster.front for cluster in graph.tracks.clusters]
+    kinds = [cluster.corner is not None for cluster in graph.tracks.clusters]
+    assert len(fronts) == len(set(zip(fronts, kinds, strict=True))) > max(fronts) + 1
+
+
+@pytest.mark.parametrize("stated", [1.0, 0.95])
+def test_squares_and_a_baseline_are_held_against_each_other(stated: float) -> None:
+    """Squares stated 5 % too small: by the baseline they are larger, by them it is shorter."""
+    problem = joint(8, 4)
+    assert problem.board is not None
+    length = float(np.linalg.norm(problem.initial.cam_from_rig[1].translation))
+    board = problem.board.board
+    small = replace(board, corners=stated * board.corners, shape_sigma=np.array([2e-3, 0.0, 0.0]))
+    problem = replace(
+        problem,
+        board=replace(problem.board, board=small),
+        scales=(KnownBaseline((0, 1), length, 2e-3 * length),),
+    )
+    found = refine(problem, GraphOptions(), 1.0)
+    covariance = calibration_covariance(found.graph, found.estimate, found.values)
+    described = SimpleNamespace(board=SimpleNamespace(unit_m=0.12 * stated))
+    run = SimpleNamespace(refinement=found, covariance=covariance, board=described)
+    baseline, squares = ledger_of(run).entries  # type: ignore[arg-type]
+    assert squares.name == f"square of the board ({120 * stated:g} mm)"
+    assert squares.measured_m == pytest.approx(0.12 * stated)
+    assert squares.sigma_m == pytest.approx(2e-3 * squares.measured_m)
+    assert squares.predicted_m == pytest.approx(0.12, rel=0.01)
+    assert baseline.predicted_m == pytest.approx(length * stated, rel=0.01)
+    assert squares.z is not None and baseline.z == pytest.approx(-squares.z, rel=0.02)
+    if stated < 1:
+        assert squares.contradicts and squares.z < -10
+        assert squares.measured_m < squares.estimated_m < 0.12
+    else:
+        assert abs(squares.z) < 3
+
+
+def test_what_one_view_of_a_board_leaves_open_is_for_the_board_to_show() -> None:
+    problem, _ = waved(np.random.default_rng(0), 2, 0.2, [camera("one")], [Transform.identity()])
+    found = refine(problem, GraphOptions(), 1.0)
+    covariance = calibration_covariance(found.graph, found.estimate, found.values)
+    told = observe(found.graph, found.estimate, covariance.stated, covariance.model)
+    focal = [one for one in told.weak if one.kind.startswith("focal")]
+    assert focal and all("tilt the board" in one.remedy for one in focal)
