@@ -172,7 +172,7 @@ BAD = [
     (CHECKERBOARD.replace("[8, 6]", "8"), "takes a list, like [8, 6]"),
     (CHECKERBOARD.replace("[8, 6]", "[8, 1]"), "inner_corners.1"),
     (CHECKERBOARD.replace("0.025", "-1"), "greater than 0"),
-    (CHECKERBOARD.replace("0.025", "250"), "less than or equal to 100"),
+    (CHECKERBOARD.replace("0.025", "250"), "longer than any square; give metres: 0.25 for 250 mm"),
     (CHECKERBOARD.replace("0.025", ".nan"), "square_m"),
     (CHARUCO.replace("0.03", "0.05"), "smaller than a square of 0.04 m"),
     (CHARUCO + "dictionary: DICT_4X4_60\n", "DICT_4X4_50"),

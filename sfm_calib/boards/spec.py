@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from graphs.frames import FloatArray
 from graphs.problem import IntArray
@@ -25,7 +25,21 @@ MOST = 100  # of anything along one side of a board
 TAG36H11_IDS = 587  # tags in the family
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
-Length = Annotated[float, Field(gt=0, le=100)]  # m; a larger one is surely in mm
+LONGEST_M = 2.0  # of a square or a tag: what is longer was given in mm or in squares
+
+
+def _in_metres(length_m: float) -> float:
+    if not length_m > 0:
+        raise ValueError(f"{length_m:g} m is no length; give metres, as 0.025")
+    if length_m > LONGEST_M:
+        raise ValueError(
+            f"{length_m:g} m is longer than any square; give metres: {length_m / 1000:g} for "
+            f"{length_m:g} mm"
+        )
+    return length_m
+
+
+Length = Annotated[float, AfterValidator(_in_metres)]
 Count = Annotated[int, Field(ge=2, le=MOST)]
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
+from graphs.boards import N_WHOLE, shape_of
 from graphs.frames import FloatArray
-from graphs.problem import Estimate, Problem, residuals_px
+from graphs.problem import Estimate, Problem
 from sfm_calib.board_record import BoardResult
 from sfm_calib.report.digits import short
 from sfm_calib.report.theme import (
@@ -32,7 +33,6 @@ SEEN = {
 }
 NOTICED = 2.0  # sigmas from which a bend or a size is worth a word
 ARROW_OF_BOARD = 0.04  # a typical arrow, of the board's longer side
-FEWEST_VIEWS = 3  # of a corner, for a mean of its residuals
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,17 @@ def board_section(
     board = calibration.board
     if board is None or problem.board is None:
         return None
-    shared, factor = corners_figure(problem, estimate)
-    panels = [
-        Panel(
-            "What corners share",
-            f"Mean residual of each corner over all its views, on the board; arrows {factor:g} "
-            "times as long as they are, at one scale in px. Corners that err alike in all views "
-            "are printed or found wrongly.",
-            figure_html(shared, "board-corners"),
+    panels = []
+    if board.corners_off_mm > 0:
+        places, factor = corners_figure(problem, estimate)
+        panels.append(
+            Panel(
+                "Where corners lie",
+                f"How far each corner lies off its place on the board; arrows {factor:g} times as "
+                "long as they are. A pattern is a board that was printed longer one way, or askew.",
+                figure_html(places, "board-corners"),
+            )
         )
-    ]
     panels += [
         Panel(
             f"Views of {camera.name}",
@@ -145,25 +146,15 @@ def gains(calibration: Calibration) -> tuple[GainRow, ...]:
 
 
 def corners_figure(problem: Problem, estimate: Estimate) -> tuple[go.Figure, float]:
-    """Mean residual of each corner as an arrow on the board, and how many mm a px is drawn as."""
+    """How far each corner lies off its place as an arrow on the board, so many times as long."""
     board = problem.board
     assert board is not None
-    seen = problem.observations
-    rows = board.known[seen.point]
-    corner = board.corner[seen.point[rows]]
-    off = residuals_px(estimate, seen)[rows]
-    good = np.isfinite(off[:, 0])
-    count = np.bincount(corner[good], minlength=len(board.board.corners))
-    mean = (
-        np.stack([np.bincount(corner[good], off[good, k], len(count)) for k in (0, 1)], axis=1)
-        / np.maximum(count, 1)[:, None]
-    )
-    mean[count < FEWEST_VIEWS] = 0
+    off = 1e3 * shape_of(estimate, board.board)[N_WHOLE:].reshape(-1, 3)
     places = 1e3 * board.board.corners[:, :2]
-    typical = float(np.sqrt((mean**2).sum(1).mean()))
+    typical = float(np.sqrt((off[:, :2] ** 2).sum(1).mean()))
     side = float(np.ptp(places, axis=0).max())
     factor = round_number(ARROW_OF_BOARD * side / typical) if typical > 0 else 1.0
-    ends = places + factor * mean
+    ends = places + factor * off[:, :2]
     figure = go.Figure()
     line = polyline([np.stack(pair) for pair in zip(places, ends, strict=True)])
     figure.add_scatter(
@@ -174,11 +165,10 @@ def corners_figure(problem: Problem, estimate: Estimate) -> tuple[go.Figure, flo
         x=places[:, 0].astype(np.float32), y=places[:, 1].astype(np.float32), mode="markers",
         marker={"size": 4, "color": MUTED},
         customdata=[
-            (int(index), f"{along:.3f}", f"{down:.3f}", int(n))
-            for index, ((along, down), n) in enumerate(zip(mean, count, strict=True))
+            (index, f"{x:+.3f}", f"{y:+.3f}", f"{z:+.3f}") for index, (x, y, z) in enumerate(off)
         ],
-        hovertemplate="corner %{customdata[0]}<br>(%{customdata[1]}, %{customdata[2]}) px"
-        "<br>%{customdata[3]} views<extra></extra>",
+        hovertemplate="corner %{customdata[0]}<br>right %{customdata[1]}, down %{customdata[2]}, "
+        "away %{customdata[3]} mm<extra></extra>",
     )  # fmt: skip
     styled(figure, height=360)
     figure.update_layout(showlegend=False)
