@@ -40,8 +40,8 @@ SIGNIFICANCE = 0.01
 # say p2 = 0.003, p1 and p2 remove 0.019 to 0.025 px, on the street 0.08 px. In units of the noise
 # the fountain's gain is as large as the corridor's, and its p1 is 6 stated sigmas from zero.
 LEAST_GAIN_PX = 0.01
-# Of the noise, where that is less than any feature's: corners of boards have 0.02 to 0.1 px, and a
-# board seen in seven views showed a missing p1, p2 by 0.006 px, which were 7 sigmas of cx.
+# Of the noise of a board's corners, 0.02 to 0.1 px, which do not drift as features do: a board seen
+# in seven views showed a missing p1, p2 by 0.006 px, which were 7 sigmas of cx.
 LEAST_GAIN_SHARE = 0.05
 # Of the sigma believed of a coefficient before any image, what the data may leave by the model.
 # Rational's six coefficients keep 0.7 of it on the fountain; of the rungs below, none on the three
@@ -251,7 +251,10 @@ def _judged(
     gain_sigmas = gain / error if error > 0 else 0.0
     weak = _weak(trial, autos)
     added = len(trial.rung.coefficients) - len(against.rung.coefficients)
-    least_px = min(LEAST_GAIN_PX, LEAST_GAIN_SHARE * sigma_px) * max(added, 1) ** 0.5
+    least_px = LEAST_GAIN_PX
+    if trial.graph.problem.board_frames.all():
+        least_px = min(least_px, LEAST_GAIN_SHARE * sigma_px)
+    least_px *= max(added, 1) ** 0.5
     moved = np.array([trial.cameras[i].params[:4] - against.cameras[i].params[:4] for i in autos])
     costs = trial.costs[np.isfinite(trial.costs)]
     return RungResult(

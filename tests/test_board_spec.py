@@ -171,7 +171,7 @@ BAD = [
     ("type: checkerboard\ninner_corners: [8, 6]\n", "square_m: is missing"),
     (CHECKERBOARD.replace("[8, 6]", "8"), "takes a list, like [8, 6]"),
     (CHECKERBOARD.replace("[8, 6]", "[8, 1]"), "inner_corners.1"),
-    (CHECKERBOARD.replace("0.025", "-1"), "greater than 0"),
+    (CHECKERBOARD.replace("0.025", "-1"), "no length; give metres"),
     (CHECKERBOARD.replace("0.025", "250"), "longer than any square; give metres: 0.25 for 250 mm"),
     (CHECKERBOARD.replace("0.025", ".nan"), "square_m"),
     (CHARUCO.replace("0.03", "0.05"), "smaller than a square of 0.04 m"),

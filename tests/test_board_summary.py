@@ -157,8 +157,17 @@ def test_there_is_a_panel_of_each_camera_that_saw_it():
     problem, truth = waved(np.random.default_rng(1), 4, 0.1)
     section = board_section(with_board(left_out=("left/1: blurred",)), problem, truth)
     assert section is not None and section.left_out == ("left/1: blurred",)
-    assert [panel.title for panel in section.panels] == ["What corners share", "Views of left"]
+    assert [panel.title for panel in section.panels] == ["Views of left"]
+    off = replace(truth, board_shape=np.append(np.zeros(3), 1e-4 * np.ones(truth_corners(problem))))
+    section = board_section(with_board(corners_off_mm=0.1), problem, off)
+    assert section is not None
+    assert [panel.title for panel in section.panels] == ["Where corners lie", "Views of left"]
     assert board_section(rig(), problem, truth) is None
+
+
+def truth_corners(problem: Problem) -> int:
+    assert problem.board is not None
+    return int(problem.board.board.corners.size)
 
 
 # ---- the ledger ----------------------------------------------------------------------------

@@ -156,7 +156,7 @@ def test_a_board_that_is_flat_is_held_flat(run_of):
 def test_the_report_shows_the_board(run_of):
     out, _ = run_of(*MONO)
     page = (out / "report.html").read_text()
-    for part in ('<section id="board">', "What corners share", "Views of camera", "board-views-0"):
+    for part in ('<section id="board">', "Where corners lie", "Views of camera", "board-views-0"):
         assert part in page
     assert "scan alone, sigma" not in page  # there is none
 
