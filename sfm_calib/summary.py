@@ -17,6 +17,7 @@ from graphs.frames import Transform
 from graphs.ladder import Ladder, RungResult
 from graphs.observability import observe
 from graphs.problem import Problem, images_seen, residuals_px
+from graphs.propagation import cross_covariance
 from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
@@ -214,12 +215,26 @@ def _scale(run: Run) -> result.Scale:
         words.append(f"board: {run.board.board.described}")
     best = words[int(np.argmin(sigmas))]
     others = len(sigmas) - 1
+    together = sum(sigma**-2 for sigma in sigmas) ** -0.5
     return result.Scale(
         source=f"{best}, and {others} more" if others else best,
-        sigma_relative=sum(sigma**-2 for sigma in sigmas) ** -0.5,
+        sigma_relative=max(together, _baseline_sigma(run) if problem.board_gives_scale else 0.0),
         contradicted=run.ledger.contradicted,
         ledger=entries_of(run.ledger),
     )
+
+
+def _baseline_sigma(run: Run) -> float:
+    """Relative sigma of the longest baseline: how well a board was seen enters it too."""
+    placed, names = run.refinement.estimate.cam_from_rig, run.scan.cameras
+    far = int(np.argmax([np.linalg.norm(t.translation) for t in placed]))
+    length = float(np.linalg.norm(placed[far].translation))
+    if length <= 0:
+        return 0.0
+    of = [f"{names[far]}.translation_{axis}" for axis in "xyz"]
+    covariance = cross_covariance(run.covariance.stated, of, of)
+    along = placed[far].translation / length
+    return float(max(along @ covariance @ along, 0.0) ** 0.5) / length
 
 
 def _solve(run: Run) -> result.Solve:
