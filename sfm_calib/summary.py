@@ -215,7 +215,7 @@ def _scale(run: Run) -> result.Scale:
         words.append(f"board: {run.board.board.described}")
     best = words[int(np.argmin(sigmas))]
     others = len(sigmas) - 1
-    together = sum(sigma**-2 for sigma in sigmas) ** -0.5
+    together = float(np.sum(np.array(sigmas) ** -2.0)) ** -0.5
     return result.Scale(
         source=f"{best}, and {others} more" if others else best,
         sigma_relative=max(together, _baseline_sigma(run) if problem.board_gives_scale else 0.0),
@@ -234,7 +234,7 @@ def _baseline_sigma(run: Run) -> float:
     of = [f"{names[far]}.translation_{axis}" for axis in "xyz"]
     covariance = cross_covariance(run.covariance.stated, of, of)
     along = placed[far].translation / length
-    return float(max(along @ covariance @ along, 0.0) ** 0.5) / length
+    return float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / length
 
 
 def _solve(run: Run) -> result.Solve:

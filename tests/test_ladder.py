@@ -18,6 +18,7 @@ from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.held_out import held_out_costs, resected, well_seen
 from graphs.ladder import (
+    BY_BOARD,
     LEAST_GAIN_PX,
     NARROW,
     SIGNIFICANCE,
@@ -48,10 +49,7 @@ K1, K2 = -0.16, 0.04
 
 
 def scanned(
-    lens: LensName,
-    coefficients: dict[str, float],
-    sigma_px: float = SIGMA_PX,
-    **changes: object,
+    lens: LensName, coefficients: dict[str, float], sigma_px: float = SIGMA_PX, **changes: object
 ) -> tuple[Problem, Estimate]:
     """A simulated scan through lenses with these coefficients, from a start without any."""
     options = TRACKS.model_copy(update={"lens": "radial", **changes})
@@ -339,14 +337,17 @@ def test_every_condition_refuses_by_itself() -> None:
         assert _verdict(**good | changed).startswith(words)
 
 
-def trial(rung: Rung, cost: float, model: float = 1e-4, stated: float = 1e-4) -> _Trial:
+def trial(
+    rung: Rung, cost: float, model: float = 1e-4, stated: float = 1e-4, of_board: bool = False
+) -> _Trial:
     """Of one camera: the same cost in 30 frames, but for a little; sigmas of its last term."""
     camera = Camera("cam0", rung.lens, (640, 480), nominal_params(rung.lens, (640, 480), 500.0))
     name = (f"cam0.{rung.coefficients[-1]}",)
     sigmas = (Covariance(name, np.array([[sigma**2]])) for sigma in (model, stated))
     covariance = SimpleNamespace(**dict(zip(("model", "stated"), sigmas, strict=True)))
+    seen = SimpleNamespace(frame=np.arange(300) % 30)
     graph = SimpleNamespace(
-        problem=SimpleNamespace(observations=SimpleNamespace(frame=np.arange(300) % 30))
+        problem=SimpleNamespace(observations=seen, board_frames=np.full(30, of_board))
     )
     costs = cost * (1 + 1e-6 * np.random.default_rng(len(rung.coefficients)).random(300))
     return _Trial(rung, graph, SimpleNamespace(cameras=(camera,)), covariance, costs)
@@ -386,3 +387,13 @@ def test_a_stated_prior_is_kept_on_every_rung() -> None:
         _, options = on_rung_of(problem, rung, options_for, [0])
         assert not options.lens_priors[0].free[0]
         assert options.lens_priors[0].mean[0] == 600.0
+
+
+def test_a_board_settles_the_tangential_terms_unless_they_are_worse() -> None:
+    def verdict(of_board: bool, cost: float, sigma: float = 1e-4, lens: LensName = "radtan") -> str:
+        longer = trial(Rung(lens), cost, sigma, sigma, of_board)
+        return _judged([trial(Rung("radial"), 1.0), longer], 0, [0], 0.05).verdict
+
+    assert verdict(True, 1 - 1e-5) == BY_BOARD
+    assert BY_BOARD not in (verdict(False, 1 - 1e-5), verdict(True, 1.1))  # of a scan; worse
+    assert BY_BOARD not in (verdict(True, 1 - 1e-5, 1.0), verdict(True, 1 - 1e-5, lens="brown"))

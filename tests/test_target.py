@@ -191,7 +191,8 @@ def test_a_rig_is_right_within_its_sigmas_and_metric(stereo):
     assert np.abs(place_off(rig.cam_from_rig["right"], RIGHT.cam_from_rig)).max() < 4
     assert max(rig.cam_from_rig["right"].sigma_translation) < 1e-3
     assert rig.scale.source == "board: a ChArUco board of 7 x 5 squares (DICT_4X4_50)"
-    assert rig.scale.sigma_relative == pytest.approx(1e-3) and not rig.scale.contradicted
+    # the squares are known to a thousandth, and the rig a little less for the noise
+    assert 1e-3 <= rig.scale.sigma_relative < 2e-3 and not rig.scale.contradicted
     assert [one.what for one in rig.scale.ledger] == ["square of the board (35 mm)"]
     rows = [row.split("│") for row in text.split("against the truth")[1].splitlines()]
     z = {row[1].strip(): float(row[-2]) for row in rows if len(row) > 6}
