@@ -61,7 +61,7 @@ def calibrate_with_board(
             with refusals():
                 joined, use = anchored(alone, board, views)
         messages = (*given.mapped.messages, *views.messages, *use.messages)
-        mapped = replace(given.mapped, messages=messages)
+        mapped = replace(given.mapped, problem=joined, messages=messages)
         given = replace(given, mapped=mapped, board=use, scan_alone=problem)
         return determine(given, joined, watch, progress)
 

@@ -187,6 +187,7 @@ def run_target(command: Target, arguments: Sequence[str]) -> None:
 
 def run_board(command: BoardCommand) -> None:
     """Write a board's page and its YAML."""
+    command.options.described_board()  # what is wrong with it, before what is in the way
     description = command.out.with_suffix(".yaml")
     taken = [path for path in (command.out, description) if path.exists()]
     if taken and not command.overwrite:

@@ -37,6 +37,7 @@ from sfm_calib.compare_verdict import verdict_of
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import Read, read_calibration
 
+OTHER_UNIT = 5.0  # between two lengths of one baseline: more is no error of a calibration
 IN_PX = ("fx", "fy", "cx", "cy")
 ONE_SIDED = "{} states no sigmas: it is taken as exact, and its own error is not in z or p"
 NO_SIGMAS = "neither states sigmas: there is no z and no p"
@@ -95,11 +96,12 @@ def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
     """Compare two calibrations as they were read."""
     wanted = [one for entry in options.cameras for one in entry.split(",")]
     sides = side_by_side(a, b, wanted, options.ranges)
+    _check_units(sides)
     found = difference(sides.a.estimate, sides.b.estimate, sides.frames)
     chance = chi_square(sides.a, sides.b, sides.frames)
     stated = [bool(side.root.any()) for side in (sides.a, sides.b)]
     ours, theirs = _in_one_scale(sides, found)
-    alike, errors_px = _alike(sides.a, sides.b)
+    of_a, of_b, errors_px = _alike(sides.a, sides.b)
     about = _notes(sides, errors_px, stated, chance is not None)
     record = Comparison(
         a=_side(a, stated[0]),
@@ -107,7 +109,7 @@ def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
         cameras=_matches(sides, errors_px),
         unit=sides.unit,
         taken_out=_taken_out(sides, found),
-        parameters=tuple(_parameters(sides.a, alike, sides)),
+        parameters=tuple(_parameters(of_a, of_b, sides)),
         projection={
             camera.name: tuple(_projection(found, index, r) for r in sides.frames.ranges)
             for index, camera in enumerate(sides.a.estimate.cameras)
@@ -131,6 +133,23 @@ def _side(read: Read, states_sigmas: bool) -> Side:
     )
 
 
+def _check_units(sides: Sides) -> None:
+    """Raises CalibrationError where the lengths of two metric rigs are of other units."""
+    if not all(sides.is_metric):
+        return
+    lengths = [
+        max((float(np.linalg.norm(t.translation)) for t in side.estimate.cam_from_rig), default=0)
+        for side in (sides.a, sides.b)
+    ]
+    if min(lengths) <= 0 or 1 / OTHER_UNIT < lengths[1] / lengths[0] < OTHER_UNIT:
+        return
+    larger, flag = ("B", "--metres-b") if lengths[1] > lengths[0] else ("A", "--metres-a")
+    raise CalibrationError(
+        f"lengths of {larger} are {max(lengths) / min(lengths):.4g} times those of the other: if "
+        f"they are in mm, add {flag} 0.001"
+    )
+
+
 def _in_one_scale(sides: Sides, found: Difference) -> tuple[Stated, Stated]:
     """A and B once the fitted scale is applied, to the side that has no metres of its own."""
     scale = found.changes[0].scale
@@ -139,13 +158,20 @@ def _in_one_scale(sides: Sides, found: Difference) -> tuple[Stated, Stated]:
     return sides.a, sides.b.scaled(scale)
 
 
-def _alike(a: Stated, b: Stated) -> tuple[Stated, list[float]]:
-    """B with every camera in A's lens, and how far off its pictures are then."""
+def _alike(a: Stated, b: Stated) -> tuple[Stated, Stated, list[float]]:
+    """Both with every camera in one lens, and how far off the pictures are then.
+
+    That which holds the other, for then nothing is lost; else A's.
+    """
     errors_px = []
-    for index, camera in enumerate(a.estimate.cameras):
-        b, error_px = as_lens(b, index, camera.lens)
+    for index, (one, other) in enumerate(zip(a.estimate.cameras, b.estimate.cameras, strict=True)):
+        error_px = 0.0
+        if holds(other.lens, one.lens):
+            a = as_lens(a, index, other.lens)[0]
+        else:
+            b, error_px = as_lens(b, index, one.lens)
         errors_px.append(error_px)
-    return b, errors_px
+    return a, b, errors_px
 
 
 def _matches(sides: Sides, errors_px: Sequence[float]) -> tuple[CameraMatch, ...]:
@@ -166,14 +192,18 @@ def _notes(
     """What has to be known to read the numbers."""
     both = zip(sides.a.estimate.cameras, sides.b.estimate.cameras, errors_px, strict=True)
     for one, other, error_px in both:
-        if not holds(one.lens, other.lens):
+        if not (holds(one.lens, other.lens) or holds(other.lens, one.lens)):
             yield (
                 f"{one.name} is {one.lens} in A and {other.lens} in B: for its parameters B was "
                 f"fitted as {one.lens}, {error_px:.2g} px off (rms); differences of parameters "
                 "are no finer than that, those in the picture are B's own"
             )
         elif one.lens != other.lens:
-            yield f"{one.name} is {one.lens} in A and {other.lens} in B, which is a special case"
+            special = "B" if holds(one.lens, other.lens) else "A"
+            yield (
+                f"{one.name} is {one.lens} in A and {other.lens} in B; {special}'s is a special "
+                "case of the other"
+            )
     if not any(stated):
         yield NO_SIGMAS
     elif not all(stated):

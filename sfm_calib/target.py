@@ -34,6 +34,8 @@ from sfm_calib.target_images import read_target
 # 2.4 thousandths, mrcal's of a metre by one or two mm. Held-out errors of those sets are smallest
 # with 1.5e-4 to 5e-4, and by 0.5 % larger with 1e-2.
 BEND_SIGMA = 0.001
+# Of the frames that two cameras share, so many have to agree on where one stands beside the other.
+FRAMES_TO_AGREE, AGREEING_SHARE = 4, 0.3
 MIN_VIEWS = 3  # of a camera: each gives two numbers on its lens beyond the board's place
 
 
@@ -114,7 +116,16 @@ def start(views: BoardViews, board: spec.Board, config: RigConfig, scan: Scan) -
         known=known, reference=reference_of(scan, config),
     )  # fmt: skip
     with refusals():
-        return start_from_board(scene)
+        started = start_from_board(scene)
+    for link in started.links:
+        if link.frames >= FRAMES_TO_AGREE and link.agreeing < AGREEING_SHARE * link.frames:
+            a, b = (views.cameras[camera] for camera in link.cameras)
+            raise CalibrationError(
+                f"only {link.agreeing} of {link.frames} frames in which {a} and {b} both see the "
+                f"board agree on where {b} stands: their images were not taken together (try "
+                "--frames order or time), or those of one are mirrored"
+            )
+    return started
 
 
 def _is_known(config: RigConfig, name: str) -> bool:

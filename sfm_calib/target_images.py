@@ -52,6 +52,8 @@ def read_target(
         )
     files = images.find_images(folder)
     if files:
+        if tolerance_s is not None and matching != "time":
+            raise CalibrationError("--tolerance-s needs --frames time, for stems that are times")
         scan = _from_images(folder, files, matching, tolerance_s, progress)
     else:
         scan = _from_videos(folder, cache, matching, video_frames, tolerance_s, progress)

@@ -121,6 +121,16 @@ def _of_lens(run: Run) -> Iterator[result.WeakDirection]:
     )
 
 
+def _no_metres(run: Run) -> list[str]:
+    """A board that gave a rig no metres."""
+    if run.board is None or len(run.scan.cameras) == 1 or run.refinement.problem.metric:
+        return []
+    return [
+        "the board gives no metres: no frame is left in which two cameras see it at once, as the "
+        "scan has them; were its images taken together, and are cameras not swapped?"
+    ]
+
+
 def _into_the_corners(run: Run) -> str:
     if run.refinement.problem.board_frames.all():
         return "bring the board into the corners"
@@ -159,6 +169,7 @@ def _doubts(run: Run) -> list[str]:
             f"{len(lost)} images see too few points that are consistent between views, and were "
             f"left out: {some(lost)}"
         )
+    doubts += _no_metres(run)
     kept = len(refinement.problem.observations)
     rejected = refinement.n_rejected / max(kept + refinement.n_rejected, 1)
     if rejected > MANY_REJECTED:

@@ -85,6 +85,8 @@ def _check_every_camera(scan: Scan, board: Board, seen: list[BoardView]) -> None
             f"camera {scan.cameras[best]})"
         )
     reason = why_not(board, _sample(scan, images))
+    if len(without) < len(scan.cameras):
+        reason += "; or take its folder away, to calibrate the others"
     raise CalibrationError(f"looked for {board.described} in {whose} and found none: {reason}")
 
 

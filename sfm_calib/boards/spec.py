@@ -10,7 +10,15 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from graphs.frames import FloatArray
 from graphs.problem import IntArray
@@ -156,17 +164,24 @@ class Charuco(Board):
     squares: tuple[Count, Count]  # in a row, in a column
     square_m: Length
     marker_m: Length
-    dictionary: str = "DICT_4X4_50"
+    dictionary: str = Field(default="DICT_4X4_50", validate_default=True)
     legacy: bool = False  # the layout of OpenCV before 4.6, which differs for even rows
     inverted: bool = False  # printed with black and white swapped
     two_sided: bool = False  # on its back the same pattern shows through, mirrored
 
     @field_validator("dictionary")
     @classmethod
-    def _dictionary_exists(cls, name: str) -> str:
-        if name in DICTIONARIES:
-            return name
-        raise ValueError(f"OpenCV has no such dictionary; it has {_closest(name)}")
+    def _dictionary_has_enough(cls, name: str, info: ValidationInfo) -> str:
+        if name not in DICTIONARIES:
+            raise ValueError(f"OpenCV has no such dictionary; it has {_closest(name)}")
+        columns, rows = info.data.get("squares", (0, 0))
+        there = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+        if columns * rows // 2 > there:
+            raise ValueError(
+                f"{columns} x {rows} squares need {columns * rows // 2} markers, and it has "
+                f"{there}: take one of 250 or 1000"
+            )
+        return name
 
     @field_validator("marker_m")
     @classmethod

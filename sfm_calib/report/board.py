@@ -190,8 +190,13 @@ def views_figure(problem: Problem, camera: int) -> go.Figure:
     )  # fmt: skip
     width, height = lens.size
     styled(figure, height=360)
+    figure.add_shape(
+        type="rect", x0=-0.5, y0=-0.5, x1=width - 0.5, y1=height - 0.5, line={"color": MUTED}
+    )
     figure.update_layout(showlegend=False)
-    figure.update_xaxes(range=[-0.5, width - 0.5], title="x, px", scaleanchor="y")
+    figure.update_xaxes(
+        range=[-0.5, width - 0.5], title="x, px", scaleanchor="y", constrain="domain"
+    )
     figure.update_yaxes(range=[height - 0.5, -0.5], title="y, px")
     return figure
 
