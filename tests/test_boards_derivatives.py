@@ -145,10 +145,12 @@ def test_the_sigma_of_the_shape_is_that_of_the_data_and_of_what_is_stated() -> N
 
 
 def test_corners_are_weighed_among_each_other() -> None:
-    sigma_px = np.array([0.02, 0.04, 0.08])
+    """What detection does not tell, all of them share."""
+    told, untold = np.array([0.02, 0.04, 0.8]), 0.07
+    sigma_px, expected = told, np.hypot(told, untold)
     none = np.zeros(3, np.int64)
     seen = SeenCorners(np.zeros((3, 2)), none, none, np.arange(3), sigma_px)
-    assert observed(seen, np.arange(3)).relative_sigma == pytest.approx([0.5, 1.0, 2.0])
+    assert observed(seen, np.arange(3)).relative_sigma == pytest.approx(expected / expected[1])
     problem = board_problem(
         flat_board(), seen, [camera("one")], [Transform.identity()], [Transform.identity()],
         ["a"], 0,

@@ -197,7 +197,7 @@ BOARDS = {
     "no size": (CHECKER, "inner_corners: is missing, and a board of type checkerboard needs it"),
     "an unknown key": (f"{CHECKER}inner_corner: [8, 6]", "did you mean 'inner_corners'?"),
     "one number": (f"{CHECKER}inner_corners: 8\nsquare_m: 0.02", "takes a list, like [8, 6]"),
-    "negative": (f"{CHECKER}inner_corners: [8, 6]\nsquare_m: -1", "greater than 0 (got -1)"),
+    "negative": (f"{CHECKER}inner_corners: [8, 6]\nsquare_m: -1", "-1 m is no length; give metres"),
     "in micrometres": (f"{CHECKER}inner_corners: [8, 6]\nsquare_m: 25000", "(got 25000)"),
     "no YAML": ("type: {", "board.yaml is not valid YAML in line 1"),
     "Kalibr's": ("target_type: checkerboard\ntargetCols: 8", "targetRows: is missing"),
@@ -273,7 +273,7 @@ SIZE = ["--type", "checkerboard", "--inner-corners", "8", "6"]
 PRINTS = {
     "no type": ([], "no type: write 'type: checkerboard'"),
     "no size": (SIZE, "square_m: is missing, and a board of type checkerboard needs it"),
-    "negative": ([*SIZE, "--square-m", "-0.02"], "square_m: Input should be greater than 0"),
+    "negative": ([*SIZE, "--square-m", "-0.02"], "square_m: -0.02 m is no length; give metres"),
     "one row": ([*SIZE[:-1], "1", "--square-m", "0.02"], "inner_corners.1: Input should be"),
     "too large": (
         [*SIZE, "--square-m", "0.1", "--page", "a4"],
