@@ -43,6 +43,7 @@ def errors_of(problem: Problem) -> tuple[SharedErrors, int]:
     return shared, len(whiten)
 
 
+@pytest.mark.slow
 def test_frames_that_see_few_corners_do_not_seem_to_err_together() -> None:
     """Six numbers of each frame are fitted to twenty coordinates."""
     ratios, of_all = [], []

@@ -191,6 +191,7 @@ def keys(out):
     return sorted(path.stem for path in (out / "cache").glob("*.key"))
 
 
+@pytest.mark.slow
 def test_stopped_runs_are_resumed(tmp_path, capfd):
     out = tmp_path / "out"
     code, _, _ = stop_at("mapping", signal.SIGKILL, out)

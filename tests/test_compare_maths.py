@@ -265,12 +265,14 @@ def p_values(side: Stated, frames: Frames, count: int, times: float = 1.0) -> Fl
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_p_values_of_a_camera_drawn_twice_are_uniform() -> None:
     one = rig_of(Transform.identity(), lens=camera_of("radtan"))
     p = p_values(Stated(one, covariance_of(one)), ALONE, 40)
     assert stats.kstest(p, "uniform").pvalue > 0.01
 
 
+@pytest.mark.slow
 def test_p_values_of_a_rig_drawn_twice_are_uniform() -> None:
     one = stereo(lens=camera_of("radial"))
     p = p_values(Stated(one, covariance_of(one)), SMALL, 10)

@@ -172,6 +172,7 @@ def test_the_study_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "RMSE" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_scans_are_the_same_in_any_number_of_processes() -> None:
     cases = [Case("wall", "heavy")]
     alone, together = study(cases, 2)[0], study(cases, 2, jobs=2)[0]

@@ -367,16 +367,15 @@ def test_clicks_may_lie_on_the_outermost_pixels() -> None:
 # ---- a scan of images -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_path_between_frames_makes_a_scan_metric(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The rendered rig's baseline, known through nothing but how far the rig moved."""
     copytree(simulation() / "scan", tmp_path / "scan")
     frames = json.loads((simulation() / "truth_frames.json").read_text())
-    ends = [
-        Transform.from_wxyz(t["rotation_wxyz"], t["translation"]).inverse.translation
-        for t in (frames["000000"], frames["000005"])
-    ]
+    both = frames["000000"], frames["000005"]
+    ends = [Transform.from_wxyz(*t.values()).inverse.translation for t in both]
     said = {"length_m": float(np.linalg.norm(ends[1] - ends[0])), "sigma_m": 0.001}
     arguments = ["calibrate", str(tmp_path / "scan"), "-o", str(tmp_path / "out"), *QUICK]
 

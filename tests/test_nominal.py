@@ -145,6 +145,7 @@ def good_problem():
     return simulate_tracks(TrackOptions(frames=6, points=300), np.random.default_rng(0))[0]
 
 
+@pytest.mark.slow
 def test_a_nominal_rig_is_imposed_on_the_mapping(tmp_path, monkeypatch) -> None:
     """Free mapping that finds nothing leaves the field to the mapping with the nominal rig."""
     copytree(simulation() / "scan", tmp_path / "scan")

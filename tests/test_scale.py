@@ -225,6 +225,7 @@ def test_a_sigma_is_the_tapes_and_the_pixels(source: ScaleSource) -> None:
 
 
 @each_source
+@pytest.mark.slow
 def test_sigmas_hold(source: ScaleSource) -> None:
     """Forty tapes and forty scans: the baseline is as far off as its sigma says."""
     z = []

@@ -157,6 +157,7 @@ def test_removing_a_source_by_algebra_leaves_the_ledger_of_the_others() -> None:
     assert ledger_of(two).contradicted and ledger_of(two).suspects == ()
 
 
+@pytest.mark.slow
 def test_z_is_standard_normal() -> None:
     """Forty scans with four tapes each, all of which err by their sigmas."""
     z = np.array(

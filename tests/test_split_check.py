@@ -39,6 +39,7 @@ def checked(problem: Problem, stretch: float = 1.0) -> SplitCheck | None:
     return split_check(graph, estimate, covariance, 1.0)
 
 
+@pytest.mark.slow
 def test_halves_of_independent_noise_agree_as_often_as_they_should() -> None:
     """p-values of 20 scans are spread over 0 to 1, and the mean square is what was expected."""
     checks = [checked(problem_of(seed, baseline_sigma_m=0.0)) for seed in range(20)]

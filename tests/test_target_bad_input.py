@@ -167,6 +167,7 @@ def test_two_boards_in_one_folder_are_told(tmp_path, images):
     assert "leave out the images of one" in said
 
 
+@pytest.mark.slow
 def test_a_board_that_is_never_tilted_leaves_the_focal_length_weak(tmp_path, images, capsys):
     arguments = target(tmp_path, CHECKERBOARD, {"cam0": images("frontal")}, "--lens", "radial")
     assert main(arguments) == 0

@@ -308,6 +308,7 @@ def test_mrcal_is_left_out_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> N
     assert target_peers.programs_of(BOARD, "radial")[1] == "it has no such lens"
 
 
+@pytest.mark.slow
 def test_the_tables_show_programs_side_by_side(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
