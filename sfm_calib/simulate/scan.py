@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict
 import sfm_calib
 from graphs.frames import Transform
 from graphs.lenses import LensName
+from sfm_calib.boards.load import board_from, board_yaml
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import Calibration, load_calibration, save_calibration, truth
 from sfm_calib.simulate.render import SUPERSAMPLING, RenderOptions, ray_table, render
@@ -206,15 +207,17 @@ def _write_rig(rig: SimulatedRig, path: Path) -> None:
 
 
 def _write_board(board: HungBoard, staging: Path) -> None:
-    record: dict[str, object] = {
-        "type": board.kind,
-        "columns": board.columns,
-        "rows": board.rows,
-        "square_m": board.square_m,
-    }
+    squares = board.columns, board.rows
+    described: dict[str, object] = {"type": board.kind, "square_m": board.square_m}
     if board.kind == "charuco":
-        record |= {"marker_m": board.marker_m, "dictionary": board.dictionary}
-    (staging / "board.yaml").write_text(yaml.safe_dump(record, sort_keys=False))
+        described |= {
+            "squares": squares,
+            "marker_m": board.marker_m,
+            "dictionary": board.dictionary,
+        }
+    else:
+        described |= {"inner_corners": (squares[0] - 1, squares[1] - 1)}
+    (staging / "board.yaml").write_text(board_yaml(board_from(described)))
     _write_json({"world_from_board": _record(board.world_from_board)}, staging / "truth_board.json")
 
 
