@@ -25,9 +25,9 @@ SHOWN_DIRECTIONS = 2.0
 LEAST_REDUNDANCY = 0.1  # of one observation that outweighs the rest of its track
 # The sigma of so many, by their median, is itself known to 4 %.
 CLASS_SIZE = 400
-# Of corners: fewer, and their own places take what would tell their noise. Eight corners of one view
-# came out with 0.0002 px.
-BOARD_CLASS_SIZE = 40
+# Of corners: fewer, and their own places take what would tell their noise. Eight of one view came
+# out with 0.0002 px.
+BOARD_CLASS_SIZE = 24
 WIDEST_FACTOR = 10.0  # between a class's sigma and that of all: beyond, something else is wrong
 
 
