@@ -187,6 +187,7 @@ def tape(factor: float) -> KnownBaseline:
     return KnownBaseline((0, 1), factor * true_m, 1e-3 * true_m)
 
 
+@pytest.mark.slow
 def test_of_three_lengths_the_wrong_one_is_named():
     truth = solved_scan().truth
     first, last = (truth.rig_from_world[i].inverse.translation for i in (0, -1))

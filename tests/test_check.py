@@ -89,6 +89,7 @@ def checked(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_a_calibration_after_a_check_reuses_its_stages(tmp_path, checked, capfd):
     out = tmp_path / "out"
     shutil.copytree(checked, out)

@@ -158,6 +158,7 @@ def test_a_scan_that_cannot_be_used_is_a_refusal(monkeypatch: pytest.MonkeyPatch
 # ---- all of it -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_study_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "coverage.json"
     summaries = main(Options(scans=2, only=("wall",), out=out))

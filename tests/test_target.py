@@ -161,6 +161,7 @@ def test_the_report_shows_the_board(run_of):
     assert "scan alone, sigma" not in page  # there is none
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_numbers(run_of):
     first, _ = run_of(*MONO)
     second, text = run_of(*MONO, "--json")

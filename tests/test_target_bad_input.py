@@ -157,6 +157,7 @@ def test_a_truth_of_other_cameras(tmp_path, refused):
 # ---- images that show it badly -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_boards_in_one_folder_are_told(tmp_path, images):
     cameras = {"": [*images("checkerboard"), *images("other")]}
     assert main(target(tmp_path, CHECKERBOARD, cameras, "--lens", "radial", "--json")) == 0
