@@ -13,7 +13,6 @@ from graphs.frames import FloatArray, Transform
 from graphs.problem import (
     Board,
     BoardPoints,
-    BoolArray,
     Estimate,
     IntArray,
     Observations,
@@ -35,12 +34,6 @@ class SeenCorners:
     camera: IntArray  # (n,)
     corner: IntArray  # (n,) index into Board.corners
     sigma_px: FloatArray  # (n,) of one coordinate, as detection has it
-
-    def subset(self, keep: BoolArray) -> SeenCorners:
-        return SeenCorners(
-            self.pixels[keep], self.frame[keep], self.camera[keep], self.corner[keep],
-            self.sigma_px[keep],
-        )  # fmt: skip
 
 
 def board_problem(

@@ -127,7 +127,7 @@ def solve_part(
         rest = select_tracks(
             replace(problem, initial=estimate, observations=seen.subset(keep)), min_parallax_deg
         )
-        if rest.metric != problem.metric or _of_board_alone(rest) != _of_board_alone(problem):
+        if rest.metric != problem.metric or rest.of_board_alone != problem.of_board_alone:
             return None
         if rest.board is None and problem.board is not None:  # what is known of it is a prior still
             scene = np.zeros(len(rest.initial.points), dtype=bool)
@@ -182,13 +182,9 @@ def _of_lost_scale(problem: Problem, frames: NDArray[np.bool_]) -> IntArray:
     part = replace(
         problem, observations=problem.observations.subset(frames[problem.observations.frame])
     )
-    if part.metric or _of_board_alone(problem):  # without a scan that fails, and is said
+    if part.metric or problem.of_board_alone:  # without a scan that fails, and is said
         return np.empty(0, np.int64)
     return problem.frames_of_scale
-
-
-def _of_board_alone(problem: Problem) -> bool:
-    return bool(problem.board_frames.all())
 
 
 def change(estimate: Estimate, other: Estimate, names: tuple[str, ...]) -> FloatArray:

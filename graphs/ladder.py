@@ -258,7 +258,7 @@ def _judged(
     weak = _weak(trial, autos)
     added = len(trial.rung.coefficients) - len(against.rung.coefficients)
     least_px = LEAST_GAIN_PX
-    if trial.graph.problem.board_frames.all():
+    if trial.graph.problem.of_board_alone:
         least_px = min(least_px, LEAST_GAIN_SHARE * sigma_px)
     least_px *= max(added, 1) ** 0.5
     moved = np.array([trial.cameras[i].params[:4] - against.cameras[i].params[:4] for i in autos])
@@ -267,7 +267,7 @@ def _judged(
     if len(trials) > 1:
         verdict = _verdict(gain_px, least_px, gain_sigmas, n_frames, weak)
         told = not weak and n_frames > 1 and gain_sigmas > CLEARLY_WORSE
-        of_board = bool(trial.graph.problem.board_frames.all())
+        of_board = trial.graph.problem.of_board_alone
         if verdict != TAKEN and trial.rung == TANGENTIAL and told and of_board:
             verdict = BY_BOARD
     return RungResult(

@@ -122,7 +122,7 @@ def _of_scene(problem: Problem) -> Problem:
     if problem.board is None:
         return problem
     seen, start = problem.observations, problem.initial
-    if not problem.board_frames.all():
+    if not problem.of_board_alone:
         return replace(problem, observations=seen.subset(~problem.known[seen.point]), board=None)
     corners = corners_of(problem.board.board, shape_of(start, problem.board.board))[0]
     return replace(

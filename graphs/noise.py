@@ -40,7 +40,7 @@ def free_dimensions(problem: Problem, options: GraphOptions | None = None) -> in
     frames = len(np.unique(seen.frame))
     points = int(np.count_nonzero(~problem.known[np.unique(seen.point)]))
     gauge = 6 if problem.metric else 7
-    if problem.board_frames.all():
+    if problem.of_board_alone:
         gauge = 0
     rig = 6 * (len(start.cameras) - 1)
     lenses = _free_lens_parameters(problem, options)

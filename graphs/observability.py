@@ -73,7 +73,7 @@ def observe(
 ) -> Observability:
     """All there is to say of an optimum; unit: of the covariances' lengths, in the estimate's."""
     views = views_of(replace(graph.problem, initial=estimate))
-    by_board = bool(graph.problem.board_frames.all())
+    by_board = graph.problem.of_board_alone
     reported = estimate.scaled(1 / unit)
     seen = graph.problem.observations
     distances = typical_distances(reported, seen).tolist()

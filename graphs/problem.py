@@ -174,6 +174,11 @@ class Problem:
         return frames
 
     @property
+    def of_board_alone(self) -> bool:
+        """Whether every frame has a board as its world: there is no scan."""
+        return bool(self.board_frames.all())
+
+    @property
     def metric(self) -> bool:
         """Whether lengths of the rig are in metres: measured, or seen against a board."""
         return bool(self.scales) or self.board_gives_scale

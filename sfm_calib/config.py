@@ -25,6 +25,7 @@ from graphs.losses import LossChoice
 from graphs.refine import MAX_OBSERVATIONS
 from graphs.selection import MIN_TRACK_LENGTH
 from sfm_calib.errors import CalibrationError
+from sfm_calib.files import read_text
 
 RIG_FILE = "rig.yaml"
 FEWEST_TWINS = 10  # the mean of fewer is known to a third and less
@@ -250,18 +251,7 @@ def load_rig_config(path: Path) -> RigConfig:
     misnamed = path.with_suffix(".yml")
     if misnamed.exists() and not path.exists():
         raise CalibrationError(f"{misnamed} is not read: call it {path.name}")
-    try:
-        content = yaml.safe_load(path.read_text("utf-8")) if path.exists() else {}
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise CalibrationError(
-            f"{path} is no text: byte {error.start} is not UTF-8; write it as YAML"
-        ) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f" in line {where.line + 1}" if where else ""
-        raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
+    content = read_yaml(path) if path.exists() else {}
     if content is None:
         content = {}
     if not isinstance(content, dict):
@@ -272,6 +262,17 @@ def load_rig_config(path: Path) -> RigConfig:
         return RigConfig.model_validate(content)
     except ValidationError as error:
         raise CalibrationError(f"{path}: {first_problem(error)}") from error
+
+
+def read_yaml(path: Path) -> object:
+    """What a YAML file holds. Raises CalibrationError naming the line that is wrong."""
+    text = read_text(path, "write it as YAML")
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f" in line {where.line + 1}" if where else ""
+        raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
 
 
 def error_text(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Whole files or none: every output appears under its name only when it is complete."""
+"""Files: read with a reason where they cannot be, and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -34,6 +34,18 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     finally:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def read_text(path: Path, remedy: str, encoding: str = "utf-8") -> str:
+    """A text file. Raises CalibrationError when it cannot be read, or is no text: with a remedy."""
+    try:
+        return path.read_text(encoding)
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(
+            f"{path} is no text: byte {error.start} is not UTF-8; {remedy}"
+        ) from error
 
 
 def sha256(path: Path) -> str:

@@ -132,7 +132,7 @@ def _no_metres(run: Run) -> list[str]:
 
 
 def _into_the_corners(run: Run) -> str:
-    if run.refinement.problem.board_frames.all():
+    if run.refinement.problem.of_board_alone:
         return "bring the board into the corners"
     return "let things of the scene pass through the corners"
 

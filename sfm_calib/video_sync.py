@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from sfm_calib.errors import CalibrationError
+from sfm_calib.files import read_text
 from sfm_calib.timestamps import IntArray, group_by_time, number_of, read_times, told_of
 
 SYNC_FILE = "timestamps.csv"  # as caliscope writes it
@@ -204,11 +205,4 @@ def _times_in(path: Path) -> list[str]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text("utf-8-sig").splitlines()
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise CalibrationError(
-            f"{path} is no text: byte {error.start} is not UTF-8; write one time a line"
-        ) from error
+    return read_text(path, "write one time a line", "utf-8-sig").splitlines()

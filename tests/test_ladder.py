@@ -346,9 +346,7 @@ def trial(
     sigmas = (Covariance(name, np.array([[sigma**2]])) for sigma in (model, stated))
     covariance = SimpleNamespace(**dict(zip(("model", "stated"), sigmas, strict=True)))
     seen = SimpleNamespace(frame=np.arange(300) % 30)
-    graph = SimpleNamespace(
-        problem=SimpleNamespace(observations=seen, board_frames=np.full(30, of_board))
-    )
+    graph = SimpleNamespace(problem=SimpleNamespace(observations=seen, of_board_alone=of_board))
     costs = cost * (1 + 1e-6 * np.random.default_rng(len(rung.coefficients)).random(300))
     return _Trial(rung, graph, SimpleNamespace(cameras=(camera,)), covariance, costs)
 

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from sfm_calib.boards.spec import BOARD_TYPES, Board
-from sfm_calib.config import error_text
+from sfm_calib.config import read_yaml
 from sfm_calib.errors import CalibrationError
 
 SQUARE_TOLERANCE = 1e-6  # relative; both are typed, not measured
@@ -80,19 +79,11 @@ def _scalar(value: object) -> str:
 
 def _read(path: Path) -> object:
     try:
-        return yaml.safe_load(path.read_text("utf-8"))
-    except FileNotFoundError as error:
-        raise CalibrationError(f"no such board: {path}; give a YAML file") from error
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise CalibrationError(
-            f"{path} is no text: byte {error.start} is not UTF-8; write it as YAML"
-        ) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f" in line {where.line + 1}" if where else ""
-        raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
+        return read_yaml(path)
+    except CalibrationError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise CalibrationError(f"no such board: {path}; give a YAML file") from error
+        raise
 
 
 def _first_problem(error: ValidationError, kind: type[Board], spell: Callable[[str], str]) -> str:

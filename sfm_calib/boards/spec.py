@@ -6,6 +6,7 @@ the squares of a ChArUco board, the tags of an AprilGrid, the circles of a grid 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
 import cv2
@@ -85,9 +86,9 @@ class Board(BaseModel):
         return self.corner_sigma_m
 
     @property
+    @abstractmethod
     def corners_m(self) -> FloatArray:
         """Corners (n, 3) in the board's frame, in the order of their numbers; z = 0."""
-        raise NotImplementedError
 
     @property
     def symmetries(self) -> tuple[IntArray, ...]:
@@ -96,19 +97,19 @@ class Board(BaseModel):
         return ()
 
     @property
+    @abstractmethod
     def columns(self) -> int:
         """Corners in a row."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def rows(self) -> int:
         """Corners in a column."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def described(self) -> str:
         """The board in a few words, as messages call it."""
-        raise NotImplementedError
 
 
 class Checkerboard(Board):
