@@ -10,7 +10,7 @@ from rich.table import Table
 from sfm_calib.compare_record import Comparison, PairDifference, ParameterDifference
 from sfm_calib.compare_verdict import p_text, px_text
 from sfm_calib.report.digits import short
-from sfm_calib.terminal import SUSPICIOUS_Z, sigma_text, with_digits
+from sfm_calib.terminal import SUSPICIOUS_Z, print_line, sigma_text, table_of, with_digits
 
 NONE = "-"
 
@@ -18,7 +18,7 @@ NONE = "-"
 def print_compared(record: Comparison, console: Console) -> None:
     """Tables, notes, and the verdict last."""
     for letter, side in (("A", record.a), ("B", record.b)):
-        _print(console, f"{letter}: {side.path} ({side.format}: {', '.join(side.cameras)})")
+        print_line(console, f"{letter}: {side.path} ({side.format}: {', '.join(side.cameras)})")
     console.print(_parameters(record))
     console.print(_projections(record))
     if record.pairs:
@@ -26,17 +26,17 @@ def print_compared(record: Comparison, console: Console) -> None:
         if any(pair.depth for pair in record.pairs):
             console.print(_depths(record))
     if (chance := record.chance) is not None:
-        _print(
+        print_line(
             console,
             f"chi-square {chance.chi2:.1f} in {chance.rank} directions of the picture that can be "
             f"judged, of {chance.n_parameters} parameters with sigmas; {p_text(chance)}; "
             f"{px_text(chance.outside_px)} rms lie where no sigma reaches",
         )
-    _print(console, f"taken out: {taken_out(record)}")
+    print_line(console, f"taken out: {taken_out(record)}")
     for note in record.notes:
-        _print(console, f"note: {note}")
+        print_line(console, f"note: {note}")
     for number, line in enumerate(record.verdict.lines):
-        _print(console, f"verdict: {line}" if number == 0 else f"  {line}")
+        print_line(console, f"verdict: {line}" if number == 0 else f"  {line}")
 
 
 def taken_out(record: Comparison) -> str:
@@ -59,21 +59,8 @@ def _length(vector: Sequence[float]) -> float:
     return float(sum(x * x for x in vector) ** 0.5)
 
 
-def _print(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=not console.is_terminal)
-
-
-def _table(*columns: str) -> Table:
-    table = Table()
-    for column in columns:
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    first = table.columns[0]
-    first.justify, first.no_wrap, first.overflow = "left", False, "fold"
-    return table
-
-
 def _parameters(record: Comparison) -> Table:
-    table = _table("", "A", "B", "B - A", "sigma", "z", "")
+    table = table_of("", "A", "B", "B - A", "sigma", "z", "")
     current = ""
     for row in record.parameters:
         camera, _, parameter = row.name.rpartition(".")
@@ -108,7 +95,7 @@ def at_range(distance: float | None, unit: str | None) -> str:
 
 
 def _projections(record: Comparison) -> Table:
-    table = _table("in the picture, px", "range", "mean", "rms", "most", "centre", "corner")
+    table = table_of("in the picture, px", "range", "mean", "rms", "most", "centre", "corner")
     for name, told in record.projection.items():
         for index, one in enumerate(told):
             table.add_row(
@@ -122,7 +109,7 @@ def _projections(record: Comparison) -> Table:
 
 
 def _places(record: Comparison) -> Table:
-    table = _table("", "turned by deg", "sigma", "baseline A", "B", "B / A", "sigma")
+    table = table_of("", "turned by deg", "sigma", "baseline A", "B", "B / A", "sigma")
     for pair in record.pairs:
         longer, spread = pair.baseline_percent, pair.sigma_baseline_percent
         table.add_row(
@@ -138,7 +125,7 @@ def _places(record: Comparison) -> Table:
 
 
 def _depths(record: Comparison) -> Table:
-    table = _table("depths by A, B true", "range", "median", "worst", "middle", "sigma")
+    table = table_of("depths by A, B true", "range", "median", "worst", "middle", "sigma")
     for pair in record.pairs:
         for index, cells in enumerate(_depth_cells(pair, record.unit)):
             table.add_row(

@@ -95,12 +95,12 @@ def print_result(calibration: Calibration, console: Console) -> None:
     """The parameters with their sigmas, and what is to be said of them."""
     marks = marks_of(calibration)
     for name, camera in calibration.cameras.items():
-        _print_line(
+        print_line(
             console,
             f"{name}: {camera.lens}, {camera.size[0]} x {camera.size[1]} px, "
             f"{camera.n_images} images, {camera.n_observations} observations",
         )
-        table = _table("", "value", "sigma", "of noise alone", "from priors", "")
+        table = table_of("", "value", "sigma", "of noise alone", "from priors", "")
         for parameter in PARAMETER_NAMES[camera.lens]:
             value, sigma = camera.params[parameter], camera.sigma.get(parameter, 0.0)
             share = camera.prior_share.get(parameter, 0.0)
@@ -128,8 +128,8 @@ def _print_lens_choice(calibration: Calibration, console: Console) -> None:
     """The ladder of lenses, a rung a row."""
     if (choice := calibration.lens_choice) is None:
         return
-    _print_line(console, f"lens by frames held out ({choice.n_frames}, in turn): {choice.reason}")
-    table = _table("", "error px", "gain px", "centre moves", "weak")
+    print_line(console, f"lens by frames held out ({choice.n_frames}, in turn): {choice.reason}")
+    table = table_of("", "error px", "gain px", "centre moves", "weak")
     for index, rung in enumerate(choice.rungs):
         first = index == 0
         table.add_row(
@@ -146,9 +146,9 @@ def _print_board(calibration: Calibration, console: Console) -> None:
     if calibration.board is None:
         return
     for line in board_lines(calibration.board):
-        _print_line(console, line)
+        print_line(console, line)
     if rows := gains(calibration):
-        table = _table("", "sigma of the scan", "with the board", "gain", "moved")
+        table = table_of("", "sigma of the scan", "with the board", "gain", "moved")
         for row in rows:
             table.add_row(row.name, row.alone, row.joint, row.gain, row.moved)
         console.print(table)
@@ -170,18 +170,18 @@ def _print_basis(calibration: Calibration, console: Console) -> None:
     """What the numbers rest on."""
     solve, noise = calibration.solve, calibration.noise
     if solve and noise:
-        _print_line(
+        print_line(
             console,
             f"{solve.n_images} images in {solve.n_frames} frames, {solve.n_points} points, "
             f"{solve.n_observations} observations",
         )
-        _print_line(
+        print_line(
             console,
             f"{solve.n_rejected} mismatches set aside; noise {noise.sigma_px:.2f} px, "
             f"sigmas {noise.inflation:.1f} x those of noise alone (median)",
         )
     if solve and (chosen := solve.selection):
-        _print_line(
+        print_line(
             console,
             f"{chosen.kept} of {chosen.available} observations chosen (max_observations): model "
             f"sigmas {chosen.sigma_factor:.2f} x those of all, at worst "
@@ -194,26 +194,28 @@ def _print_verdict(calibration: Calibration, console: Console) -> None:
     if (verdict := calibration.verdict) is None:
         return
     for check in checks_of(verdict):
-        _print_line(console, f"{check.title}: {check.text}")
+        print_line(console, f"{check.title}: {check.text}")
     for weak in verdict.weak:
         sizes = f": {weak.sizes}" if weak.sizes else ""
-        _print_line(console, f"weak: {weak.what}{sizes}; {weak.remedy}")
+        print_line(console, f"weak: {weak.what}{sizes}; {weak.remedy}")
     for message in verdict.messages:
-        _print_line(console, f"note: {message}")
+        print_line(console, f"note: {message}")
     if not verdict.usable:
-        _print_line(console, "NOT USABLE: see the notes above")
+        print_line(console, "NOT USABLE: see the notes above")
 
 
-def _print_line(console: Console, text: str) -> None:
+def print_line(console: Console, text: str) -> None:
     """A line that a terminal breaks between words, and a file holds whole."""
     console.print(text, soft_wrap=not console.is_terminal)
 
 
-def _table(*columns: str) -> Table:
+def table_of(*columns: str) -> Table:
+    """A table: names, whole, in the first column; numbers below titles, words below none."""
     table = Table()
     for column in columns:
         table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"  # long names: whole
+    first = table.columns[0]
+    first.justify, first.no_wrap, first.overflow = "left", False, "fold"
     return table
 
 
@@ -221,8 +223,8 @@ def _print_rig(calibration: Calibration, console: Console) -> None:
     """cam_from_rig of every camera but the reference, an axis a row."""
     rig = calibration.rig
     scale = f"scale {rig.scale.source}" if rig.metric else rig.scale.source.removeprefix("none: ")
-    _print_line(console, f"cam_from_rig: reference {rig.reference}, {scale}")
-    table = _table(
+    print_line(console, f"cam_from_rig: reference {rig.reference}, {scale}")
+    table = table_of(
         "",
         "",
         "rotation deg",
@@ -263,10 +265,10 @@ def _print_ledger(calibration: Calibration, console: Console) -> None:
     if len(ledger) < 2:
         return
     wrong = calibration.rig.scale.contradicted
-    _print_line(
+    print_line(
         console, f"{len(ledger)} measured lengths {'CONTRADICT each other' if wrong else 'agree'}"
     )
-    table = _table("", "measured m", "sigma", "found", "by the others", "sigma", "z")
+    table = table_of("", "measured m", "sigma", "found", "by the others", "sigma", "z")
     for entry in ledger:
         predicted, sigma = entry.predicted_by_others_m, entry.sigma_predicted_m
         told = predicted is not None and sigma is not None
@@ -285,8 +287,8 @@ def _print_ledger(calibration: Calibration, console: Console) -> None:
 
 def print_comparison(rows: Sequence[TruthRow], console: Console) -> None:
     """Estimate, truth, error, sigma and z of each parameter."""
-    _print_line(console, "against the truth")
-    table = _table("", "estimate", "truth", "error", "sigma", "z")
+    print_line(console, "against the truth")
+    table = table_of("", "estimate", "truth", "error", "sigma", "z")
     for row in rows:
         table.add_row(
             row.name,

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
@@ -18,16 +17,16 @@ from sfm_calib.compare_terminal import at_range, signed_percent, taken_out
 from sfm_calib.compare_verdict import p_text, px_text
 from sfm_calib.files import write_atomically
 from sfm_calib.report.digits import decimals_for, number, short
-from sfm_calib.report.image_plane import arrows, in_image
+from sfm_calib.report.image_plane import add_arrows, in_image
 from sfm_calib.report.theme import (
     AMBER,
     BLUE,
-    INK,
     MAGNITUDE_SCALE,
     MUTED,
     Panel,
     camera_colour,
     figure_html,
+    page_template,
     plain,
     round_number,
     styled,
@@ -82,15 +81,8 @@ def write_comparison(record: Comparison, found: Difference, path: Path) -> None:
 
 def render_comparison(record: Comparison, found: Difference) -> str:
     """The page as text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sfm_calib.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     shown = z_figure(record)
-    return environment.get_template("comparison.html").render(
+    return page_template("comparison.html").render(
         title=TITLE,
         record=record,
         banner=BANNERS[record.verdict.kind],
@@ -204,15 +196,7 @@ def map_figure(found: Difference, camera: int, which: int, reach: float) -> tupl
     vectors = magnification * moved[::EVERY, ::EVERY].reshape(-1, 2)
     drawn = np.isfinite(vectors).all(-1)
     if drawn.any():
-        lines = arrows(starts[drawn], vectors[drawn])
-        figure.add_scatter(
-            x=lines[:, 0],
-            y=lines[:, 1],
-            mode="lines",
-            line={"color": INK, "width": 1.2},
-            hoverinfo="skip",
-            showlegend=False,
-        )
+        add_arrows(figure, starts[drawn], vectors[drawn])
     return in_image(figure, found.a.cameras[camera]), magnification
 
 

@@ -161,7 +161,13 @@ def systematic_figure(part: CameraResiduals) -> tuple[go.Figure, float]:
     )
     centres = np.stack(np.meshgrid(x, y), axis=-1)[full]
     vectors = magnification * means[full]
-    lines = arrows(centres - vectors / 2, vectors)
+    add_arrows(figure, centres - vectors / 2, vectors)
+    return in_image(figure, camera), magnification
+
+
+def add_arrows(figure: go.Figure, starts: FloatArray, vectors: FloatArray) -> None:
+    """Arrows over a map, from starts (n, 2) along vectors (n, 2)."""
+    lines = arrows(starts, vectors)
     figure.add_scatter(
         x=lines[:, 0],
         y=lines[:, 1],
@@ -170,7 +176,6 @@ def systematic_figure(part: CameraResiduals) -> tuple[go.Figure, float]:
         hoverinfo="skip",
         showlegend=False,
     )
-    return in_image(figure, camera), magnification
 
 
 def coverage_figure(part: CameraResiduals) -> go.Figure:

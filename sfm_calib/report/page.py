@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
@@ -43,7 +42,7 @@ from sfm_calib.report.rows import (
 from sfm_calib.report.scale_ledger import ledger_section
 from sfm_calib.report.scene import rig_figure, scan_figure
 from sfm_calib.report.sigmas import sigma_section
-from sfm_calib.report.theme import Panel, figure_html
+from sfm_calib.report.theme import Panel, figure_html, page_template
 from sfm_calib.report.uncertainty import uncertainty_section
 from sfm_calib.report.weak import length_unit, weak_cards
 from sfm_calib.result import Calibration, Provenance
@@ -102,7 +101,7 @@ def render(
     lenses = camera_tables(calibration, truth_rows)
     rig = rig_tables(calibration, truth_rows) if is_rig else ()
     has_covariance = bool(calibration.covariance.names)
-    return _template().render(
+    return page_template("page.html").render(
         title=title,
         calibration=calibration,
         banner=banner(calibration),
@@ -133,17 +132,6 @@ def render(
         config=json.dumps(calibration.provenance.config, indent=2, default=str),
         plotly_js=Markup(get_plotlyjs()),
     )
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sfm_calib.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html")
 
 
 def camera_section(part: CameraResiduals, frame_names: Sequence[str]) -> CameraSection:

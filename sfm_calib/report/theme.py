@@ -6,6 +6,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jinja2
 import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
@@ -92,6 +93,18 @@ def figure_html(figure: go.Figure, key: str) -> Markup:
     return Markup(
         figure.to_html(full_html=False, include_plotlyjs=False, div_id=key, config=CONFIG)
     )
+
+
+def page_template(name: str) -> jinja2.Template:
+    """A page of this package, its outside text escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sfm_calib.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
 
 
 def evenly(n: int, at_most: int) -> NDArray[np.int64]:
