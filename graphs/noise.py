@@ -92,16 +92,16 @@ def redundancies(problem: Problem, options: GraphOptions | None = None) -> Float
     seen = problem.observations
     weight = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma**-2.0
     of_track: FloatArray = np.bincount(seen.point, weight).astype(np.float64)[seen.point]
-    # A corner's place is given; its frame has few others to take its own place from.
-    in_frame = np.bincount(seen.frame)[seen.frame]
     left = left_by_point(weight, of_track)
     if problem.board is not None:
+        # A corner's place is all but given; its frame has few others to take its own from.
         known = problem.known[seen.point]
+        in_frame = np.bincount(seen.frame)[seen.frame[known]]
         corner = problem.board.corner[seen.point[known]]
         taken = _of_corners(problem)
         views = np.bincount(corner, minlength=len(taken))
         own = (taken / np.maximum(2 * views, 1))[corner]
-        left[known] = np.maximum(1 - 3 / in_frame[known] - own, LEAST_REDUNDANCY)
+        left[known] = np.maximum(1 - 3 / in_frame - own, LEAST_REDUNDANCY)
     result: FloatArray = left * redundancy(problem, options) / float(left.mean())
     return result
 

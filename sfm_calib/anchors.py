@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from graphs.board_join import PlacedFrame, place_boards, still_board
 from graphs.board_problem import SeenCorners, beside, board_problem, standing_in
@@ -138,7 +136,7 @@ def anchored(alone: Refinement, board: spec.Board, seen: SeenBoards) -> tuple[Pr
     if scale is not None and not problem.metric:
         problem = replace(problem, initial=problem.initial.scaled(scale))
     if still is not None:
-        corners = corners_of_frames(still.frames, {i: i for i in range(len(in_scan.frames))})
+        corners = corners_of_frames(still.frames, [one.frame for one in still.frames])
         problem = standing_in(problem, graph_board(board), corners, still.world_from_board)
     elif inside.frames:
         problem = beside(problem, in_own_worlds(problem, board, inside.frames, in_scan.frames))
@@ -174,10 +172,13 @@ def of_placed_frames(views: BoardViews, problem: Problem) -> tuple[BoardViews, t
     return found, tuple(missed)
 
 
-def corners_of_frames(frames: Sequence[PlacedFrame], place: dict[int, int]) -> SeenCorners:
-    """All corners of placed frames; `place`: of each frame among the problem's."""
-    views = [view for one in frames for view in one.views]
-    return seen_corners(views, [corner for one in frames for corner in one.corners], place)
+def corners_of_frames(placed: Sequence[PlacedFrame], frames: Sequence[int]) -> SeenCorners:
+    """All corners of placed frames; `frames`: the problem's frame of each."""
+    return seen_corners(
+        [view for one in placed for view in one.views],
+        [corner for one in placed for corner in one.corners],
+        [frame for one, frame in zip(placed, frames, strict=True) for _ in one.views],
+    )
 
 
 def in_own_worlds(
@@ -187,13 +188,9 @@ def in_own_worlds(
 
     Views that no common frame links are frames of their own, though of one name.
     """
-    corners = [corners_of_frames([one], {one.frame: index}) for index, one in enumerate(placed)]
-    together = SeenCorners(
-        *(np.concatenate(column) for column in zip(*map(astuple, corners), strict=True))
-    )
     return board_problem(
         graph_board(board),
-        together,
+        corners_of_frames(placed, range(len(placed))),
         scan.initial.cameras,
         scan.initial.cam_from_rig,
         [one.rig_from_board for one in placed],

@@ -139,10 +139,13 @@ def problem_of(
     """The problem whose frames are those of the start that saw the board."""
     kept = [(index, views.views[index]) for index in started.kept]
     frames = sorted({view.frame for _, view in kept})
-    place = {frame: number for number, frame in enumerate(frames)}
     return board_problem(
         graph_board(board),
-        seen_corners([view for _, view in kept], [started.corner[i] for i, _ in kept], place),
+        seen_corners(
+            [view for _, view in kept],
+            [started.corner[index] for index, _ in kept],
+            [frames.index(view.frame) for _, view in kept],
+        ),
         started.cameras,
         started.cam_from_rig,
         [started.rig_from_board[frame] for frame in frames],
@@ -165,13 +168,13 @@ def with_lenses(problem: Problem, config: RigConfig) -> Problem:
 
 
 def seen_corners(
-    views: Sequence[SeenBoard], corners: Sequence[IntArray], place: dict[int, int]
+    views: Sequence[SeenBoard], corners: Sequence[IntArray], frames: Sequence[int]
 ) -> SeenCorners:
-    """All corners of some views, renumbered; `place`: of each frame among the problem's."""
+    """All corners of some views, renumbered; `frames`: of each view, among the problem's."""
     lengths = [len(view.pixels) for view in views]
     return SeenCorners(
         np.concatenate([view.pixels for view in views]),
-        np.repeat([place[view.frame] for view in views], lengths),
+        np.repeat(frames, lengths),
         np.repeat([view.camera for view in views], lengths),
         np.concatenate(list(corners)),
         np.concatenate([view.sigma_px for view in views]),
