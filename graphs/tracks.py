@@ -135,15 +135,7 @@ def triangulate_cluster(
     for _ in range(TRIANGULATION_STEPS):
         going_on = []
         for active in cluster.chunks(waiting):
-            n = into_cameras(
-                active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, trial,
-                *poses, s.rows, s.in_rig, s.in_cam,
-            )  # fmt: skip
-            camera, row = s.rows[:n, 3], s.rows[:n, 0]
-            project_point_many(
-                *variables.lenses, camera, s.in_cam[:n], s.pixels[:n], s.by_point[:n]
-            )
-            _weigh(tracks, cluster, s, n, row)
+            n = _see(tracks, cluster, variables, poses, active, trial, s)
             point_rows(
                 n, s.rows, cluster.anchors, trial, *poses, cluster.root_information,
                 s.by_point, s.of_point,
@@ -173,16 +165,28 @@ def _place_cluster(
     points[:] = np.hstack([away, np.ones_like(distance)]) / np.maximum(distance, 1e-300)
     poses, s, cost = variables.poses(cluster.frames), Scratch(cluster, 0), 0.0
     for active in cluster.chunks(np.arange(cluster.n_points)):
-        n = into_cameras(
-            active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, points,
-            *poses, s.rows, s.in_rig, s.in_cam,
-        )  # fmt: skip
-        project_point_many(
-            *variables.lenses, s.rows[:n, 3], s.in_cam[:n], s.pixels[:n], s.by_point[:n]
-        )
-        _weigh(tracks, cluster, s, n, s.rows[:n, 0])
+        n = _see(tracks, cluster, variables, poses, active, points, s)
         cost += float(s.costs[:n].sum())
     return cost
+
+
+def _see(
+    tracks: Tracks,
+    cluster: Cluster,
+    variables: Variables,
+    poses: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    active: IntArray,
+    points: FloatArray,
+    s: Scratch,
+) -> int:
+    """Project active points (n_points, 4) and weigh their residuals, into s; the number of rows."""
+    n = into_cameras(
+        active, cluster.begins, cluster.frame, cluster.camera, cluster.anchors, points,
+        *poses, s.rows, s.in_rig, s.in_cam,
+    )  # fmt: skip
+    project_point_many(*variables.lenses, s.rows[:n, 3], s.in_cam[:n], s.pixels[:n], s.by_point[:n])
+    _weigh(tracks, cluster, s, n, s.rows[:n, 0])
+    return n
 
 
 def _by_board(cluster: Cluster, variables: Variables, s: Scratch, n: int) -> FloatArray:
