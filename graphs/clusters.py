@@ -118,10 +118,8 @@ def make_tracks(
     root_information (n_obs,): 1 / sigma of a pixel coordinate.
     """
     seen, start = problem.observations, problem.initial
-    position = np.empty(len(elimination.order), dtype=np.int64)
-    position[elimination.order] = np.arange(len(position))
-    at = position[seen.frame]
-    earliest = np.full(len(start.points), len(position))
+    at = np.argsort(elimination.order)[seen.frame]  # position of each frame in the order
+    earliest = np.full(len(start.points), len(elimination.order))
     np.minimum.at(earliest, seen.point, at)
     known, first_seen = problem.known, earliest[seen.point]
     # By front, then by kind: else a front whose frames see a board falls to pieces.
@@ -136,13 +134,9 @@ def make_tracks(
     front = elimination.front_of[earliest[order]]
     clusters = []
     for first, last in _cuts(front, known[order], begins, elimination):
-        of_cluster = slice(begins[first], begins[last])
         frames = elimination.fronts[front[first]].frames
-        mine = rows[of_cluster]
-        corner = still = None
-        if problem.board is not None and known[order[first]]:
-            corner = problem.board.corner[order[first:last]]
-            still = problem.board.still[order[first:last]].astype(np.int64)
+        mine = rows[begins[first] : begins[last]]
+        corner, still = _of_board(problem, order[first:last])
         clusters.append(
             Cluster(
                 front=int(front[first]),
@@ -162,6 +156,13 @@ def make_tracks(
         tuple(clusters), order, columns,
         1 / (FARTHEST * float(np.median(distance))), loss, loss_scale,
     )  # fmt: skip
+
+
+def _of_board(problem: Problem, points: IntArray) -> tuple[IntArray | None, IntArray | None]:
+    """Which corners points of one kind are, and whether the board stands; None: of the scene."""
+    if problem.board is None or not problem.known[points[0]]:
+        return None, None
+    return problem.board.corner[points], problem.board.still[points].astype(np.int64)
 
 
 def _anchors(problem: Problem, rows: IntArray, begins: IntArray) -> FloatArray:
