@@ -160,7 +160,7 @@ def make_tracks(
 
 def _of_board(problem: Problem, points: IntArray) -> tuple[IntArray | None, IntArray | None]:
     """Which corners points of one kind are, and whether the board stands; None: of the scene."""
-    if problem.board is None or not problem.known[points[0]]:
+    if problem.board is None or problem.board.corner[points[0]] < 0:
         return None, None
     return problem.board.corner[points], problem.board.still[points].astype(np.int64)
 
