@@ -35,7 +35,7 @@ from sfm_calib.compare_record import (
 from sfm_calib.compare_sides import Sides, side_by_side
 from sfm_calib.compare_verdict import verdict_of
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats import Read, read_calibration
+from sfm_calib.formats import CameraRig, read_calibration
 
 OTHER_UNIT = 5.0  # between two lengths of one baseline: more is no error of a calibration
 IN_PX = ("fx", "fy", "cx", "cy")
@@ -92,7 +92,7 @@ def compare_files(a: Path, b: Path, options: CompareOptions | None = None) -> Co
     return compare(reads[0], reads[1], options)
 
 
-def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
+def compare(a: CameraRig, b: CameraRig, options: CompareOptions) -> Compared:
     """Compare two calibrations as they were read."""
     wanted = [one for entry in options.cameras for one in entry.split(",")]
     sides = side_by_side(a, b, wanted, options.ranges)
@@ -127,7 +127,7 @@ def compare(a: Read, b: Read, options: CompareOptions) -> Compared:
     return Compared(record.model_copy(update={"verdict": verdict_of(record)}), found)
 
 
-def _side(read: Read, states_sigmas: bool) -> Side:
+def _side(read: CameraRig, states_sigmas: bool) -> Side:
     return Side(
         path=str(read.path), format=read.format, cameras=read.names, states_sigmas=states_sigmas
     )

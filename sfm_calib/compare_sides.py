@@ -14,7 +14,7 @@ from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.problem import Estimate
 from sfm_calib.errors import CalibrationError, nearest
-from sfm_calib.formats import NO_SIZE, Read
+from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.uncertainty import RANGES, Unit
 
 LEAST_SPREAD = 1e-9  # of camera centres: closer together, they have no baseline
@@ -35,7 +35,7 @@ class Sides:
 
 
 def side_by_side(
-    a: Read, b: Read, cameras: Sequence[str] | None, ranges: Sequence[float] | None
+    a: CameraRig, b: CameraRig, cameras: Sequence[str] | None, ranges: Sequence[float] | None
 ) -> Sides:
     """Match cameras, image sizes and units; `ranges` in metres, or in baselines without a scale.
 
@@ -91,7 +91,7 @@ def _unit_note(metric: tuple[bool, bool]) -> str:
 
 
 def match(
-    a: Read, b: Read, wanted: Sequence[str] | None
+    a: CameraRig, b: CameraRig, wanted: Sequence[str] | None
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
     """Pairs of names, and what is to be said of them: as wanted, by name, or else by order.
 
@@ -120,7 +120,7 @@ def match(
     )
 
 
-def _as_wanted(a: Read, b: Read, wanted: Sequence[str]) -> list[tuple[str, str]]:
+def _as_wanted(a: CameraRig, b: CameraRig, wanted: Sequence[str]) -> list[tuple[str, str]]:
     pairs = []
     for entry in wanted:
         one, equals, other = entry.partition("=")
@@ -139,7 +139,7 @@ def _as_wanted(a: Read, b: Read, wanted: Sequence[str]) -> list[tuple[str, str]]
     return pairs
 
 
-def _chosen(read: Read, names: Sequence[str]) -> Read:
+def _chosen(read: CameraRig, names: Sequence[str]) -> CameraRig:
     """The same with these cameras alone, in this order."""
     places = [read.names.index(name) for name in names]
     rig = read.cam_from_rig
@@ -155,7 +155,7 @@ def _chosen(read: Read, names: Sequence[str]) -> Read:
     )
 
 
-def renamed(read: Read, names: Sequence[str]) -> Read:
+def renamed(read: CameraRig, names: Sequence[str]) -> CameraRig:
     """The same with its cameras called otherwise, one after the other."""
     new = dict(zip(read.names, names, strict=True))
     parts = [name.rpartition(".") for name in read.covariance.names]
@@ -169,7 +169,7 @@ def renamed(read: Read, names: Sequence[str]) -> Read:
     )
 
 
-def _same_sizes(a: Read, b: Read) -> tuple[Read, Read, tuple[str, ...]]:
+def _same_sizes(a: CameraRig, b: CameraRig) -> tuple[CameraRig, CameraRig, tuple[str, ...]]:
     """Sizes that one does not state are the other's. Raises CalibrationError where they differ."""
     cameras: tuple[list[Camera], list[Camera]] = ([], [])
     missing = set()
@@ -199,7 +199,7 @@ def _same_sizes(a: Read, b: Read) -> tuple[Read, Read, tuple[str, ...]]:
 # ---- lengths -------------------------------------------------------------------------------
 
 
-def _stated(read: Read) -> Stated:
+def _stated(read: CameraRig) -> Stated:
     placed = read.cam_from_rig or (Transform.identity(),) * len(read.cameras)
     return Stated(Estimate(read.cameras, placed, (), np.zeros((0, 3))), read.covariance)
 

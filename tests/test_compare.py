@@ -22,7 +22,7 @@ from sfm_calib.compare_command import Compare, run_compare
 from sfm_calib.compare_record import Comparison
 from sfm_calib.compare_terminal import print_compared
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats import NO_SIZE, LengthUnit, Read
+from sfm_calib.formats import NO_SIZE, CameraRig, LengthUnit
 from sfm_calib.formats.reading import NOTHING
 from sfm_calib.report.comparison import render_comparison
 
@@ -36,7 +36,7 @@ def made(
     unit: LengthUnit = "m",
     sigma_px: float = 0.0,
     name: str = "made",
-) -> Read:
+) -> CameraRig:
     """Independent sigmas: sigma_px in the picture from each parameter, more or less."""
     covariance = NOTHING
     if sigma_px:
@@ -49,10 +49,10 @@ def made(
             names += pose_names(camera.name)
             sigmas += [sigma_px * 2e-3] * 3 + [sigma_px * 2e-3] * 3
         covariance = Covariance(tuple(names), np.diag(np.square(sigmas)))
-    return Read(Path(name), "made", cameras, rig, unit, covariance)
+    return CameraRig(Path(name), "made", cameras, rig, unit, covariance)
 
 
-def single(sigma_px: float = 0.0, **moves: float) -> Read:
+def single(sigma_px: float = 0.0, **moves: float) -> CameraRig:
     return made((moved(LENS, **moves),), None, "unknown", sigma_px)
 
 
@@ -63,7 +63,7 @@ def moved(camera: Camera, **moves: float) -> Camera:
     return replace(camera, params=params)
 
 
-def compared(a: Read, b: Read, **options: object) -> Comparison:
+def compared(a: CameraRig, b: CameraRig, **options: object) -> Comparison:
     return compare(a, b, CompareOptions(**options)).record  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import Read, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
 
 FORMAT = "Caliscope camera_array"
 
@@ -30,7 +30,7 @@ def cameras_in(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return found
 
 
-def read_caliscope(path: Path, content: Mapping[str, Any]) -> Read:
+def read_caliscope(path: Path, content: Mapping[str, Any]) -> CameraRig:
     """Raises CalibrationError where an entry is not whole."""
     cameras: list[Camera] = []
     placed: list[Transform | None] = []
@@ -51,4 +51,4 @@ def read_caliscope(path: Path, content: Mapping[str, Any]) -> Read:
     known = [t for t in placed if t is not None]
     rig = tuple(known) if len(known) == len(cameras) else None
     notes = () if rig else (f"{path} does not say how all its cameras sit: no rig",)
-    return Read(path, FORMAT, tuple(cameras), rig, "m", notes=notes)
+    return CameraRig(path, FORMAT, tuple(cameras), rig, "m", notes=notes)

@@ -16,7 +16,7 @@ from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.colmap_lenses import LENS_OF_MODEL, out_of_model
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import Read
+from sfm_calib.formats.reading import CameraRig
 
 FORMAT = "COLMAP model"
 PIXEL_OFFSET = 0.5
@@ -50,7 +50,7 @@ class Sensor:
     cam_from_rig: Transform | None
 
 
-def read_colmap(folder: Path) -> Read:
+def read_colmap(folder: Path) -> CameraRig:
     """The cameras of a model's folder in the order of their numbers, and its rig.
 
     Raises CalibrationError for models of other lenses and for files that are not whole.
@@ -64,7 +64,7 @@ def read_colmap(folder: Path) -> Read:
     if not cameras:
         raise CalibrationError(f"{folder} is a COLMAP model without cameras")
     rig, notes = _rig_of_all(folder, rigs, sorted(cameras))
-    return Read(
+    return CameraRig(
         folder, FORMAT, tuple(cameras[i] for i in sorted(cameras)), rig, "unknown", notes=notes
     )
 

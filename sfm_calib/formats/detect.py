@@ -19,7 +19,7 @@ from sfm_calib.formats.kalibr import read_kalibr
 from sfm_calib.formats.ours import read_ours
 from sfm_calib.formats.projection_matrices import looks_like_matrices, read_matrices
 from sfm_calib.formats.qualisys import read_qualisys
-from sfm_calib.formats.reading import Read
+from sfm_calib.formats.reading import CameraRig
 from sfm_calib.formats.ros import read_ros, read_ros_pair
 
 KNOWN = (
@@ -32,7 +32,7 @@ COLMAP_FILES = ("cameras.txt", "cameras.bin")
 YAML_SUFFIXES = (".yaml", ".yml")
 
 
-def read_calibration(path: Path) -> Read:
+def read_calibration(path: Path) -> CameraRig:
     """Read a calibration of any known format, from a file or a folder.
 
     Raises CalibrationError in one line: what is wrong, or which formats are known.
@@ -56,7 +56,7 @@ def _unknown(path: Path) -> str:
     return f"{path} is no calibration that can be read: known are {KNOWN}"
 
 
-def _folder(folder: Path) -> Read:
+def _folder(folder: Path) -> CameraRig:
     if any((folder / name).is_file() for name in COLMAP_FILES):
         return read_colmap(folder)
     if (folder / "calibration.json").is_file():
@@ -74,7 +74,7 @@ def _folder(folder: Path) -> Read:
     )
 
 
-def _text(path: Path, text: str) -> Read:
+def _text(path: Path, text: str) -> CameraRig:
     start = text.lstrip("\ufeff \t\r\n")
     if start.startswith("<"):
         return _xml(path, start)
@@ -93,7 +93,7 @@ def _text(path: Path, text: str) -> Read:
     return _of_yaml(path, _yaml(text))
 
 
-def _xml(path: Path, text: str) -> Read:
+def _xml(path: Path, text: str) -> CameraRig:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -105,7 +105,7 @@ def _xml(path: Path, text: str) -> Read:
     raise CalibrationError(_unknown(path))
 
 
-def _json(path: Path, text: str) -> Read:
+def _json(path: Path, text: str) -> CameraRig:
     try:
         content = json.loads(text)
     except ValueError as error:
@@ -128,7 +128,7 @@ def _is_ros(content: Mapping[str, Any] | None) -> bool:
     return content is not None and {"camera_matrix", "image_width", "image_height"} <= set(content)
 
 
-def _of_yaml(path: Path, content: Mapping[str, Any] | None) -> Read:
+def _of_yaml(path: Path, content: Mapping[str, Any] | None) -> CameraRig:
     if content is None:
         raise CalibrationError(_unknown(path))
     if _is_ros(content):

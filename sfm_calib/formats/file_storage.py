@@ -15,7 +15,7 @@ import numpy as np
 
 from graphs.frames import FloatArray, Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, Read, opencv_camera, transform
+from sfm_calib.formats.reading import NO_SIZE, CameraRig, opencv_camera, transform
 
 FORMAT = "OpenCV FileStorage"
 MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
@@ -82,7 +82,7 @@ def load_storage(path: Path) -> Storage:
     return Storage(path, matrices, texts)
 
 
-def read_file_storage(path: Path) -> Read:
+def read_file_storage(path: Path) -> CameraRig:
     """One camera, or two with R and T; of the stereo sample's two files, either or their folder.
 
     Raises CalibrationError where there is no camera matrix.
@@ -107,7 +107,7 @@ def read_file_storage(path: Path) -> Read:
         name, _size(storage), matrix, np.zeros(0) if distortion is None else distortion, fisheye
     )
     notes = () if distortion is not None else (f"{path} states no distortion: taken as none",)
-    return Read(path, FORMAT, (camera,), None, notes=notes)
+    return CameraRig(path, FORMAT, (camera,), None, notes=notes)
 
 
 def _other(path: Path, what: str, wanted: str) -> Path | None:
@@ -123,7 +123,7 @@ def _size(storage: Storage) -> tuple[int, int]:
     return (int(width), int(height)) if width and height else NO_SIZE
 
 
-def _stereo(storage: Storage, first: FloatArray) -> Read:
+def _stereo(storage: Storage, first: FloatArray) -> CameraRig:
     second = storage.matrix([name.format(2) for name in MATRIX_OF])
     if second is None:
         raise CalibrationError(f"{storage.path} has M1 but no M2: give both cameras")
@@ -141,7 +141,7 @@ def _stereo(storage: Storage, first: FloatArray) -> Read:
     R, T = place.matrix(ROTATION), place.matrix(TRANSLATION)
     if R is None or T is None:
         notes = (f"{storage.path} has no R and T, and no {EXTRINSICS} file lies beside it",)
-        return Read(storage.path, FORMAT, tuple(cameras), None, notes=notes)
+        return CameraRig(storage.path, FORMAT, tuple(cameras), None, notes=notes)
     second_from_first = transform("R, T", R, T)
     rig = (Transform.identity(), second_from_first)
-    return Read(storage.path, FORMAT, tuple(cameras), rig, notes=notes)
+    return CameraRig(storage.path, FORMAT, tuple(cameras), rig, notes=notes)

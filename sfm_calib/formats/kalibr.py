@@ -14,13 +14,13 @@ import numpy as np
 from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import Read, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
 
 FORMAT = "Kalibr camchain"
 PINHOLE_DISTORTION = {"radtan": False, "equidistant": True, "equi": True, "none": False}
 
 
-def read_kalibr(path: Path, content: Mapping[str, Any]) -> Read:
+def read_kalibr(path: Path, content: Mapping[str, Any]) -> CameraRig:
     """Raises CalibrationError for a model that no lens here is."""
     entries = {
         str(n): e for n, e in content.items() if isinstance(e, Mapping) and "intrinsics" in e
@@ -31,7 +31,7 @@ def read_kalibr(path: Path, content: Mapping[str, Any]) -> Read:
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path} is no whole Kalibr camchain: {error!r}") from error
     notes = () if rig or len(cameras) == 1 else (f"{path} has no T_cn_cnm1: no rig",)
-    return Read(path, FORMAT, cameras, rig, "m", notes=notes)
+    return CameraRig(path, FORMAT, cameras, rig, "m", notes=notes)
 
 
 def _camera(path: Path, name: str, entry: Mapping[str, Any]) -> Camera:

@@ -8,19 +8,19 @@ import numpy as np
 
 from graphs.covariance import Covariance
 from graphs.propagation import marginal
-from sfm_calib.formats.reading import NOTHING, LengthUnit, Read
+from sfm_calib.formats.reading import NOTHING, CameraRig, LengthUnit
 from sfm_calib.result import load_calibration
 from sfm_calib.uncertainty import unit_of
 
 
-def read_ours(path: Path) -> Read:
+def read_ours(path: Path) -> CameraRig:
     """A calibration.json with its joint covariance; a truth.json has none."""
     calibration = load_calibration(path)
     names = tuple(calibration.cameras)
     stated = Covariance(calibration.covariance.names, np.array(calibration.covariance.matrix))
     known = [name for name in stated.names if name.rpartition(".")[0] in names]
     unit: LengthUnit = unit_of(calibration) or "unknown"
-    return Read(
+    return CameraRig(
         path,
         f"{calibration.format}",
         tuple(calibration.camera(name) for name in names),

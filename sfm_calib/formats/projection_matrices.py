@@ -11,7 +11,7 @@ import numpy as np
 
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, Read, opencv_camera
+from sfm_calib.formats.reading import NO_SIZE, CameraRig, opencv_camera
 
 FORMAT = "KITTI projection matrices"
 PLAIN = "camera matrix"
@@ -47,12 +47,12 @@ def _is_plain(rows: dict[str, list[float]]) -> bool:
     return [len(row) for row in rows.values()] == [3, 3, 3]
 
 
-def read_matrices(path: Path, text: str) -> Read:
+def read_matrices(path: Path, text: str) -> CameraRig:
     """Raises CalibrationError for a projection matrix that is not of a rectified camera."""
     rows = matrix_rows(text)
     if _is_plain(rows):
         camera = opencv_camera(path.stem, NO_SIZE, list(rows.values()), [])
-        return Read(path, PLAIN, (camera,), None)
+        return CameraRig(path, PLAIN, (camera,), None)
     labelled = {name: row for name, row in rows.items() if name.startswith(CAMERAS)}
     cameras, placed = [], []
     for name, row in (labelled or rows).items():
@@ -67,4 +67,4 @@ def read_matrices(path: Path, text: str) -> Read:
         cameras.append(opencv_camera(name, NO_SIZE, P[:, :3], []))
         placed.append(Transform(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3])))
     rig = tuple(placed) if len(placed) > 1 else None
-    return Read(path, FORMAT, tuple(cameras), rig, "m")
+    return CameraRig(path, FORMAT, tuple(cameras), rig, "m")

@@ -18,7 +18,7 @@ import numpy as np
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import Read, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
 
 FORMAT = "Qualisys qca"
 SUBPIXELS = 64.0
@@ -30,7 +30,7 @@ HALF_A_PIXEL = (
 )
 
 
-def read_qualisys(path: Path, root: ElementTree.Element) -> Read:
+def read_qualisys(path: Path, root: ElementTree.Element) -> CameraRig:
     """Raises CalibrationError where an entry is not whole."""
     cameras: list[Camera] = []
     placed: list[Transform] = []
@@ -43,7 +43,7 @@ def read_qualisys(path: Path, root: ElementTree.Element) -> Read:
             raise CalibrationError(f"{path}: {name} is not whole: {error!r}") from error
     if not cameras:
         raise CalibrationError(f"{path} is a Qualisys file without cameras")
-    return Read(
+    return CameraRig(
         path, FORMAT, tuple(cameras), tuple(placed), "m", notes=(f"{path}: {HALF_A_PIXEL}",)
     )
 

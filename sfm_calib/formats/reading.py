@@ -28,7 +28,7 @@ OPENCV_LENSES: dict[int, LensName] = {
 
 
 @dataclass(frozen=True)
-class Read:
+class CameraRig:
     """A calibration as it was read."""
 
     path: Path
@@ -84,7 +84,7 @@ class Read:
             ),
         )
 
-    def metric(self, metres: float) -> Read:
+    def metric(self, metres: float) -> CameraRig:
         """The same, its unit of length being so many metres."""
         if self.cam_from_rig is None:
             return self

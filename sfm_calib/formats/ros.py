@@ -14,14 +14,14 @@ import numpy as np
 
 from graphs.frames import FloatArray, Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, Read, opencv_camera, transform
+from sfm_calib.formats.reading import NO_SIZE, CameraRig, opencv_camera, transform
 
 FORMAT = "ROS camera_info"
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 KNOWN = ("plumb_bob", "rational_polynomial", "thin_prism", "none", "", *FISHEYE)
 
 
-def read_ros(path: Path, content: Mapping[str, Any]) -> Read:
+def read_ros(path: Path, content: Mapping[str, Any]) -> CameraRig:
     """One camera. Raises CalibrationError where its model is not known."""
     size = (int(content["image_width"]), int(content["image_height"]))
     model = str(content.get("distortion_model", "")).lower()
@@ -38,10 +38,10 @@ def read_ros(path: Path, content: Mapping[str, Any]) -> Read:
         distortion if model not in ("none",) else [],
         model in FISHEYE,
     )
-    return Read(path, FORMAT, (camera,), None)
+    return CameraRig(path, FORMAT, (camera,), None)
 
 
-def read_ros_pair(paths: tuple[Path, ...], contents: tuple[Mapping[str, Any], ...]) -> Read:
+def read_ros_pair(paths: tuple[Path, ...], contents: tuple[Mapping[str, Any], ...]) -> CameraRig:
     """The cameras of several files; how two of a rectified pair sit, where R and P say so."""
     reads = [read_ros(path, content) for path, content in zip(paths, contents, strict=True)]
     cameras = tuple(read.cameras[0] for read in reads)
@@ -50,7 +50,7 @@ def read_ros_pair(paths: tuple[Path, ...], contents: tuple[Mapping[str, Any], ..
         "projection_matrix" in c and "rectification_matrix" in c for c in contents
     ):
         rig = _rectified(paths, contents)
-    return Read(paths[0].parent, FORMAT, cameras, rig, "m" if rig else "unknown")
+    return CameraRig(paths[0].parent, FORMAT, cameras, rig, "m" if rig else "unknown")
 
 
 def _rectified(
