@@ -12,6 +12,7 @@ from plotly.offline import get_plotlyjs
 
 from graphs.problem import Estimate, Problem
 from sfm_calib.files import write_atomically
+from sfm_calib.provenance import Provenance
 from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
@@ -45,7 +46,7 @@ from sfm_calib.report.sigmas import sigma_section
 from sfm_calib.report.theme import Panel, figure_html, page_template
 from sfm_calib.report.uncertainty import uncertainty_section
 from sfm_calib.report.weak import length_unit, weak_cards
-from sfm_calib.result import Calibration, Provenance
+from sfm_calib.result import Calibration
 
 TITLE = "Calibration report"
 
