@@ -195,8 +195,11 @@ def stages(calibration: Calibration) -> tuple[Stage, ...]:
 def provenance_lines(provenance: Provenance) -> tuple[tuple[str, str], ...]:
     """Where the result came from, as pairs of term and text."""
     libraries = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
+    old = provenance.replaces
     lines = (
         ("sfm_calib", provenance.version or "unknown"),
+        ("Written", provenance.created.isoformat() if provenance.created else ""),
+        ("Replaces", f"{old.path} (SHA-256 {old.sha256})" if old else ""),
         ("Command", provenance.command),
         ("Seed", str(provenance.seed)),
         ("Libraries", libraries),
