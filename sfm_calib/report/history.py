@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 import plotly.graph_objects as go
@@ -25,6 +26,9 @@ from sfm_calib.report.theme import (
 TITLE = "Calibrations over time"
 NONE = "–"
 ALARM_Z = 4.0
+ISO = "%Y-%m-%d %H:%M:%S.%f"
+DODGE = 0.006  # of the time shown, by which bars of one calibration stand apart
+MARGIN = 0.05
 LABELS = {"focal_x": "fx", "focal_y": "fy", "corner": "outwards"}
 SHOWN: dict[Group, tuple[str, str]] = {
     "focal": ("Focal length", "Pixels per radian on the axis, whatever the lens model."),
@@ -76,7 +80,7 @@ def render_history(record: History) -> str:
         title=TITLE,
         record=record,
         cameras=[CameraHistory(name, _panels(record, name)) for name in record.cameras],
-        baselines=_panel(record, "baseline", None, "baselines"),
+        baselines=_panel(record, "baseline", None, "figure-baseline"),
         rows=[row for entry in record.entries for row in _cells(entry)],
         changes={entry.number: _largest(entry) for entry in record.entries},
         alarm_z=ALARM_Z,
@@ -125,12 +129,19 @@ def history_figure(record: History, group: Group, camera: str | None) -> go.Figu
     if not traces:
         return None
     figure = go.Figure()
+    moments = [entry.when for entry in record.entries]
+    span = max(moments[-1] - moments[0], timedelta(seconds=1))
     for index, (name, points) in enumerate(traces.items()):
-        _add_trace(figure, name, points, camera_colour(index), camera)
+        aside = DODGE * span * (index - (len(traces) - 1) / 2)
+        _add_trace(figure, name, points, camera_colour(index), camera, aside)
     styled(figure, height=300)
     unit = next(iter(traces.values()))[0][1].unit
-    figure.update_yaxes(title=f"since the first, {plain(unit)}", zeroline=True)
-    figure.update_xaxes(type="date")
+    figure.update_yaxes(
+        title=f"since the first, {plain(unit)}", zeroline=True, exponentformat="none"
+    )
+    ends = [moments[0] - MARGIN * span, moments[-1] + MARGIN * span]
+    figure.update_xaxes(type="date", range=[one.strftime(ISO) for one in ends])
+    figure.update_layout(showlegend=True)
     return figure
 
 
@@ -140,12 +151,13 @@ def _add_trace(
     points: Sequence[tuple[HistoryEntry, Quantity]],
     colour: str,
     camera: str | None,
+    aside: timedelta,
 ) -> None:
     before, _, parameter = name.rpartition(".")
     label = plain(before if camera is None else _label(parameter))
     first = points[0][1]
     figure.add_scatter(
-        x=[entry.when.strftime("%Y-%m-%d %H:%M:%S") for entry, _ in points],
+        x=[(entry.when + aside).strftime(ISO) for entry, _ in points],
         y=[one.since_first for _, one in points],
         mode="lines+markers",
         name=f"{label} ({number(first.value, decimals_for(first.sigma or 0.0))})",
@@ -159,7 +171,8 @@ def _add_trace(
             "width": 3,
         },
         customdata=[
-            f"{label} {_with_sigma(one)}<br>#{entry.number} {plain(entry.path)}"
+            f"{label} {_with_sigma(one)}<br>#{entry.number} {plain(entry.path)}, "
+            f"{entry.when:%Y-%m-%d %H:%M}"
             for entry, one in points
         ],
         hovertemplate="%{customdata}<br>%{y:+.4g} since the first<extra></extra>",
