@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,6 +44,7 @@ from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.images import camera_names, check_exists
+from sfm_calib.provenance import now
 from sfm_calib.report import TruthRow, write_report
 from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
@@ -299,7 +301,9 @@ def output_folder(out: Path) -> Iterator[None]:
 
 def finish(outcome: Outcome, out: Path, rows: Sequence[TruthRow], as_json: bool) -> None:
     """Write calibration.json and report.html, both or none, and print the result."""
-    calibration = outcome.calibration
+    provenance = outcome.calibration.provenance.model_copy(update={"created": now()})
+    calibration = outcome.calibration.model_copy(update={"provenance": provenance})
+    outcome = replace(outcome, calibration=calibration)
     write_results(outcome, out, rows)
     if as_json:
         print(calibration.model_dump_json(indent=1))

@@ -23,6 +23,7 @@ from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
 from sfm_calib.board_summary import board_result
+from sfm_calib.provenance import Provenance
 from sfm_calib.run import Run
 from sfm_calib.scale import in_words
 from sfm_calib.scale_ledger import entries_of, ledger_of
@@ -273,8 +274,8 @@ def _selection(budget: Budget | None) -> result.Selection | None:
     return None if budget is None else result.Selection(**asdict(budget))
 
 
-def _provenance(run: Run) -> result.Provenance:
-    return result.Provenance(
+def _provenance(run: Run) -> Provenance:
+    return Provenance(
         version=sfm_calib.__version__,
         versions={"python": platform.python_version()}
         | {name: version(name) for name in LIBRARIES},

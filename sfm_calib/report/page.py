@@ -12,6 +12,7 @@ from plotly.offline import get_plotlyjs
 
 from graphs.problem import Estimate, Problem
 from sfm_calib.files import write_atomically
+from sfm_calib.provenance import Provenance
 from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
@@ -45,7 +46,7 @@ from sfm_calib.report.sigmas import sigma_section
 from sfm_calib.report.theme import Panel, figure_html, page_template
 from sfm_calib.report.uncertainty import uncertainty_section
 from sfm_calib.report.weak import length_unit, weak_cards
-from sfm_calib.result import Calibration, Provenance
+from sfm_calib.result import Calibration
 
 TITLE = "Calibration report"
 
@@ -194,8 +195,11 @@ def stages(calibration: Calibration) -> tuple[Stage, ...]:
 def provenance_lines(provenance: Provenance) -> tuple[tuple[str, str], ...]:
     """Where the result came from, as pairs of term and text."""
     libraries = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
+    old = provenance.replaces
     lines = (
         ("sfm_calib", provenance.version or "unknown"),
+        ("Written", provenance.created.isoformat() if provenance.created else ""),
+        ("Replaces", f"{old.path} (SHA-256 {old.sha256})" if old else ""),
         ("Command", provenance.command),
         ("Seed", str(provenance.seed)),
         ("Libraries", libraries),
