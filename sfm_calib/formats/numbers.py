@@ -7,8 +7,8 @@ import numpy as np
 from graphs.frames import FloatArray
 from sfm_calib.errors import CalibrationError
 
-LARGEST = 1e12  # of any number of a calibration: what is made of it stays finite
-LARGEST_SIDE_PX = 1_000_000
+LARGEST = 1e9  # of any number of a calibration: what is made of it stays finite
+LARGEST_SIDE_PX = 100_000
 
 
 def numbers(what: str, entry: object, *shape: int) -> FloatArray:
