@@ -12,23 +12,32 @@ from xml.etree import ElementTree
 import yaml
 
 from sfm_calib.errors import CalibrationError
+from sfm_calib.formats.bounded import MOST_BYTES, bounded_bytes
 from sfm_calib.formats.caliscope import cameras_in, read_caliscope
-from sfm_calib.formats.colmap_model import read_colmap
 from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS, read_file_storage
 from sfm_calib.formats.kalibr import read_kalibr
+from sfm_calib.formats.mrcal import SUFFIX, looks_like_mrcal, read_mrcal, read_mrcal_files
+from sfm_calib.formats.nerf import NAME as TRANSFORMS
+from sfm_calib.formats.nerf import looks_like_nerf, read_nerf
 from sfm_calib.formats.ours import read_ours
 from sfm_calib.formats.projection_matrices import looks_like_matrices, read_matrices
 from sfm_calib.formats.qualisys import read_qualisys
 from sfm_calib.formats.reading import CameraRig
+from sfm_calib.formats.rig_config import NAME as RIG_CONFIG
+from sfm_calib.formats.rig_config import (
+    looks_like_rig_config,
+    read_colmap_folder,
+    read_rig_config,
+)
 from sfm_calib.formats.ros import read_ros, read_ros_pair
 
 KNOWN = (
     "sfm_calib's calibration.json, OpenCV FileStorage (YAML, XML, JSON), ROS camera_info, "
-    "a COLMAP model's folder, Kalibr's camchain, Caliscope's camera_array.toml, Qualisys' "
-    ".qca.txt, KITTI's calib.txt"
+    "a COLMAP model's folder or rig_config.json, Kalibr's camchain, mrcal's .cameramodel, NeRF's "
+    "transforms.json, Caliscope's camera_array.toml, Qualisys' .qca.txt, KITTI's calib.txt"
 )
-MOST_BYTES = 50_000_000  # of a calibration; beyond, it is something else
 COLMAP_FILES = ("cameras.txt", "cameras.bin")
+JSON_FILES = (RIG_CONFIG, TRANSFORMS)
 YAML_SUFFIXES = (".yaml", ".yml")
 
 
@@ -40,7 +49,7 @@ def read_calibration(path: Path) -> CameraRig:
     if path.is_dir():
         return _folder(path)
     if path.name in COLMAP_FILES:
-        return read_colmap(path.parent)
+        return read_colmap_folder(path.parent)
     try:
         if path.stat().st_size > MOST_BYTES:
             raise CalibrationError(_unknown(path))
@@ -58,9 +67,14 @@ def _unknown(path: Path) -> str:
 
 def _folder(folder: Path) -> CameraRig:
     if any((folder / name).is_file() for name in COLMAP_FILES):
-        return read_colmap(folder)
+        return read_colmap_folder(folder)
     if (folder / "calibration.json").is_file():
         return read_ours(folder / "calibration.json")
+    for name in JSON_FILES:
+        if (folder / name).is_file():
+            return read_calibration(folder / name)
+    if models := sorted(p for p in folder.iterdir() if p.suffix == SUFFIX):
+        return read_mrcal_files({p: bounded_bytes(p).decode("utf-8", "replace") for p in models})
     found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
     for path in found:
         if path.stem in (INTRINSICS, EXTRINSICS):
@@ -78,7 +92,9 @@ def _text(path: Path, text: str) -> CameraRig:
     start = text.lstrip("\ufeff \t\r\n")
     if start.startswith("<"):
         return _xml(path, start)
-    if start.startswith("{"):
+    if looks_like_mrcal(start):
+        return read_mrcal(path, start)
+    if start.startswith("{") or _is_json_list(start):
         return _json(path, start)
     if start.startswith("%YAML") or "!!opencv-matrix" in text:
         return read_file_storage(path)
@@ -91,6 +107,11 @@ def _text(path: Path, text: str) -> CameraRig:
     if cameras_in(content):
         return read_caliscope(path, content)
     return _of_yaml(path, _yaml(text))
+
+
+def _is_json_list(start: str) -> bool:
+    """A list of objects; TOML's tables start with [ too."""
+    return start.startswith("[") and start[1:].lstrip().startswith("{")
 
 
 def _xml(path: Path, text: str) -> CameraRig:
@@ -108,8 +129,14 @@ def _xml(path: Path, text: str) -> CameraRig:
 def _json(path: Path, text: str) -> CameraRig:
     try:
         content = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path} is no whole JSON: {error}") from error
+    if looks_like_rig_config(content):
+        return read_rig_config(path, content)
+    if looks_like_nerf(content):
+        return read_nerf(path, content)
+    if not isinstance(content, Mapping):
+        raise CalibrationError(_unknown(path))
     if "cameras" in content or str(content.get("format", "")).startswith("sfm_calib"):
         return read_ours(path)
     return read_file_storage(path)
