@@ -13,6 +13,7 @@ from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.simulate.scan import SimulateOptions
 from sfm_calib.simulate.tracks import TrackOptions
+from sfm_calib.undistort_command import Rectify, Undistort
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="OUT")]
 Verbose = Annotated[bool, tyro.conf.arg(aliases=("-v",))]
@@ -140,4 +141,7 @@ class BoardCommand:
     """Replace files that are there."""
 
 
-Command = Calibrate | Target | Compare | BoardCommand | Check | Simulate | SimulateTracks | Demo
+Command = (
+    Calibrate | Target | Compare | BoardCommand | Check | Undistort | Rectify
+    | Simulate | SimulateTracks | Demo
+)  # fmt: skip
