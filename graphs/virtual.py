@@ -110,7 +110,7 @@ def inside_zoom(virtual: Camera, views: Sequence[Turned]) -> float:
 
     def sees_all(zoom: float) -> bool:
         return all(
-            within(source_pixels(zoomed(virtual, zoom), view, edge), view.camera.size).all()
+            within(source_pixels(zoomed(virtual, zoom), view, edge), view.camera.size, 0.0).all()
             for view in views
         )
 
@@ -130,9 +130,11 @@ def source_pixels(virtual: Camera, view: Turned, pixels: FloatArray) -> FloatArr
     return project(view.camera, rays @ view.virtual_from_cam)  # rows: turned by its transpose
 
 
-def within(pixels: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which of the pixels (..., 2) lie on an image, its outermost pixels whole."""
-    inside = (pixels >= -0.5) & (pixels <= np.array(size) - 0.5)
+def within(
+    pixels: NDArray[np.floating], size: tuple[int, int], margin: float = 0.5
+) -> NDArray[np.bool_]:
+    """Which of the pixels (..., 2) lie on an image; margin: so far beyond its outermost centres."""
+    inside = (pixels >= -margin) & (pixels <= np.array(size) - 1.0 + margin)
     return np.asarray(inside.all(axis=-1))
 
 
