@@ -99,18 +99,18 @@ def whole_zoom(virtual: Camera, views: Sequence[Turned]) -> float:
 
 
 def inside_zoom(virtual: Camera, views: Sequence[Turned]) -> float:
-    """The smallest zoom with which every pixel of a virtual camera is in the image of every view.
+    """The smallest zoom with which every pixel of a virtual camera is whole in every real image.
 
-    The pixels of its edge stand for all: what a lens sees has no holes. NaN where no zoom does.
+    The outline of its image stands for all: what a lens sees has no holes. NaN where no zoom does.
     """
-    across, down = (np.arange(n, dtype=np.float64) for n in virtual.size)
-    sides = [(across, 0 * across), (across, 0 * across + down[-1])]
-    sides += [(0 * down, down), (0 * down + across[-1], down)]
+    across, down = (np.arange(n + 1) - 0.5 for n in virtual.size)
+    sides = [(across, 0 * across + down[end]) for end in (0, -1)]
+    sides += [(0 * down + across[end], down) for end in (0, -1)]
     edge = np.concatenate([np.stack(side, axis=-1) for side in sides])
 
     def sees_all(zoom: float) -> bool:
         return all(
-            within(source_pixels(zoomed(virtual, zoom), view, edge), view.camera.size, 0.0).all()
+            within(source_pixels(zoomed(virtual, zoom), view, edge), view.camera.size).all()
             for view in views
         )
 
@@ -130,11 +130,9 @@ def source_pixels(virtual: Camera, view: Turned, pixels: FloatArray) -> FloatArr
     return project(view.camera, rays @ view.virtual_from_cam)  # rows: turned by its transpose
 
 
-def within(
-    pixels: NDArray[np.floating], size: tuple[int, int], margin: float = 0.5
-) -> NDArray[np.bool_]:
-    """Which of the pixels (..., 2) lie on an image; margin: so far beyond its outermost centres."""
-    inside = (pixels >= -margin) & (pixels <= np.array(size) - 1.0 + margin)
+def within(pixels: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which of the pixels (..., 2) lie on an image, its outermost pixels whole."""
+    inside = (pixels >= -0.5) & (pixels <= np.array(size) - 0.5)
     return np.asarray(inside.all(axis=-1))
 
 
