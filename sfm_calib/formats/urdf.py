@@ -112,4 +112,4 @@ def _text(root: Element) -> bytes:
     return text + b"\n"
 
 
-URDF = Format(FORMAT, LENS_NAMES, "any", "", write_urdf)
+URDF = Format(FORMAT, LENS_NAMES, "any", "", write_urdf, metres=True)
