@@ -155,7 +155,7 @@ def options_of(problem: Problem, config: RigConfig) -> GraphOptions:
     return GraphOptions(
         loss=loss,
         loss_scale=SCALE_95[loss],
-        lens_priors=lens_priors(problem.initial, config, problem.board is not None),
+        lens_priors=lens_priors(problem.initial, config, problem.board is not None, problem.prior),
         rig_priors=rig_priors(problem.initial, config, problem.reference, problem.metric),
         shared_lenses=shared_lenses(problem, config),
     )

@@ -41,6 +41,7 @@ from sfm_calib.commands import (
 from sfm_calib.compare_command import Compare, run_compare
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
+from sfm_calib.convert_command import Convert, run_convert
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.history_command import HistoryCommand, run_history
@@ -52,6 +53,7 @@ from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.tracks import simulate_tracks, write_tracks
 from sfm_calib.target import calibrate_target
 from sfm_calib.terminal import print_comparison, print_result, progress_bars, result_console
+from sfm_calib.undistort_command import Rectify, Undistort, run_rectify, run_undistort
 
 LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 EXIT_BAD_INPUT = 2
@@ -73,7 +75,10 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[HistoryCommand, tyro.conf.subcommand("history")]
+        | Annotated[Convert, tyro.conf.subcommand("convert")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
+        | Annotated[Undistort, tyro.conf.subcommand("undistort")]
+        | Annotated[Rectify, tyro.conf.subcommand("rectify")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -140,8 +145,16 @@ def run(command: Command, arguments: Sequence[str]) -> None:
     elif isinstance(command, HistoryCommand):
         with output_folder(command.out) if command.out else nullcontext():
             run_history(command)
+    elif isinstance(command, Convert):
+        run_convert(command)
     elif isinstance(command, Check):
         run_check(command, arguments)
+    elif isinstance(command, Undistort):
+        with output_folder(command.out):
+            run_undistort(command, told(arguments))
+    elif isinstance(command, Rectify):
+        with output_folder(command.out):
+            run_rectify(command, told(arguments))
     elif isinstance(command, Simulate):
         with progress_bars() as progress:
             simulate_scan(command.options, command.out, progress, command.overwrite)

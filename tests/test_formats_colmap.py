@@ -67,7 +67,12 @@ def test_colmap_files_that_cannot_be(tmp_path: Path) -> None:
     written(path, "# nothing\n")
     assert "without cameras" in refused(tmp_path)
     written(path, "1 OPENCV 640 480 500\n")
+    assert "has 1 numbers, not 8" in refused(tmp_path)
+    written(path, "1 OPENCV 640\n")
     assert "no whole COLMAP model" in refused(tmp_path)
+    for bad in ("nan 500 320 240", "-500 500 320 240"):
+        written(path, f"1 PINHOLE 640 480 {bad}\n")
+        assert "not finite" in refused(tmp_path) or "not positive" in refused(tmp_path)
     path.unlink()
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<QIi", 3, 1, 4))
     assert "no whole COLMAP model" in refused(tmp_path)
