@@ -14,11 +14,15 @@ from sfm_calib.files import RESULT_FILE, calibration_files, calibration_sha256
 from sfm_calib.formats import CameraRig, read_calibration
 from sfm_calib.formats.detect import COLMAP_FILES, YAML_SUFFIXES
 from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS
+from sfm_calib.formats.mrcal import SUFFIX
 from sfm_calib.formats.ours import rig_of
+from sfm_calib.formats.rig_config import NAME as RIG_CONFIG
 from sfm_calib.provenance import to_the_second
 from sfm_calib.result import Calibration, load_calibration
 
-SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".toml", ".cameramodel")
+SUFFIXES = (".json", *YAML_SUFFIXES, ".xml", ".toml", SUFFIX)
+ONE_A_CAMERA = ((SUFFIX,), YAML_SUFFIXES)  # of formats that have a file a camera: mrcal's, ROS's
+OF_A_MODEL = (".txt", ".bin")  # COLMAP's
 TEXTS = ("calib", ".qca.")  # in the names of text files that are calibrations
 NOT_CALIBRATED = ("truth.json",)  # what a simulation knows: no calibration
 # Folders beside a calibration.json whose calibrations are steps to it, or copies of it.
@@ -98,10 +102,12 @@ def candidates(folder: Path) -> Iterator[Path]:
         names = sorted(files, key=lambda name: (name != RESULT_FILE, name))
         if any(name in files for name in COLMAP_FILES):
             yield Path(place)
-            names = [name for name in names if not name.endswith((".txt", ".bin"))]
-        elif RESULT_FILE not in files and _is_ros_rig(Path(place), names):
-            yield Path(place)
-            names = [name for name in names if not name.endswith(YAML_SUFFIXES)]
+            names = [n for n in names if not n.endswith(OF_A_MODEL) and n != RIG_CONFIG]
+        elif RESULT_FILE not in files:
+            for suffixes in ONE_A_CAMERA:
+                if _are_one_rig(Path(place), names, suffixes):
+                    yield Path(place)
+                    names = [name for name in names if not name.endswith(suffixes)]
         yield from (Path(place, name) for name in names if _is_plausible(name, names))
 
 
@@ -114,12 +120,14 @@ def _is_plausible(name: str, beside: Sequence[str]) -> bool:
     return name.endswith(SUFFIXES) or is_text
 
 
-def _is_ros_rig(place: Path, names: Sequence[str]) -> bool:
-    """Whether its YAML files, one a camera, are one rig together."""
-    if sum(name.endswith(YAML_SUFFIXES) for name in names) < 2:
+def _are_one_rig(place: Path, names: Sequence[str], suffixes: tuple[str, ...]) -> bool:
+    """Whether these files of a folder, one a camera, say together how the cameras sit."""
+    if sum(name.endswith(suffixes) for name in names) < 2:
         return False
     try:
         read = read_calibration(place)
     except CalibrationError:
         return False
-    return read.path == place and len(read.cameras) > 1
+    if read.path != place or read.cam_from_rig is None:
+        return False
+    return any((t.translation != read.cam_from_rig[0].translation).any() for t in read.cam_from_rig)

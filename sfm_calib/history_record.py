@@ -6,7 +6,7 @@ from typing import Final, Literal, get_args
 
 from pydantic import AwareDatetime
 
-from sfm_calib.recalibration_record import DriftVerdict
+from graphs.drift import Verdict as DriftVerdict
 from sfm_calib.record import Record
 
 FORMAT: Final = "sfm_calib/history/1"

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field, model_validator
 
+from graphs.drift import Verdict as DriftVerdict
+from graphs.problem import PriorMode
 from sfm_calib.provenance import Replaced
 from sfm_calib.record import Record
-
-# OLD as the start alone, as a weak belief, or with the whole covariance that it states.
-PriorMode = Literal["start", "weak", "full"]
-DriftVerdict = Literal["keep", "replace", "inconclusive"]
 
 
 class OldCalibration(Replaced):
@@ -35,7 +31,7 @@ class Recalibration(Record):
     """From which calibration, how far it was believed, and what it contributed."""
 
     old: OldCalibration
-    prior: PriorMode
+    prior: PriorMode  # OLD as the start alone, a weak belief, or with all that it states
     freed: tuple[str, ...]  # what was estimated anew, in words
     kept: tuple[str, ...] = ()  # cameras that the scan lacks: OLD's values, untouched
     added: tuple[str, ...] = ()  # cameras that OLD lacks

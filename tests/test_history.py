@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from test_partial import NAMES, in_baseline, result_of, true_rig, uncertain
 
+from graphs.frames import Transform, exp_rotation
 from graphs.pose_covariance import rereferenced
 from sfm_calib.cli import main
 from sfm_calib.errors import CalibrationError
@@ -29,12 +31,12 @@ DAY = datetime(2026, 1, 1, 12, tzinfo=UTC)
 
 
 def written(
-    rig: CameraRig, path: Path, day: int | None = 0, reference: str = "a", **more: object
+    made_rig: CameraRig, path: Path, day: int | None = 0, reference: str = "a", **more: object
 ) -> Calibration:
     """A calibration.json of a day; None: it does not say of which."""
     created = None if day is None else DAY + timedelta(days=day)
-    provenance = Provenance(version="1", created=created, replaces=more.pop("replaces", None))
-    whole = result_of(rig, reference).model_copy(update={"provenance": provenance} | more)
+    made = Provenance(version="1", created=created, replaces=more.pop("replaces", None))
+    whole = result_of(made_rig, reference).model_copy(update={"provenance": made} | more)
     save_calibration(whole, path)
     return whole
 
@@ -128,7 +130,7 @@ def test_formats_of_others(tmp_path: Path) -> None:
     placed = np.eye(4)
     placed[0, 3] = -0.3
     chain["cam1"]["T_cn_cnm1"] = placed.tolist()
-    (tmp_path / "camchain.yaml").write_text(json.dumps(chain))
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(chain))
     os.utime(tmp_path / "camchain.yaml", (0, (DAY + timedelta(days=1)).timestamp()))
     model = tmp_path / "model"
     model.mkdir()
@@ -195,8 +197,6 @@ def test_another_reference_is_the_same_rig(tmp_path: Path) -> None:
 
 
 def test_turns_are_about_the_axes_of_the_camera(tmp_path: Path) -> None:
-    from graphs.frames import Transform, exp_rotation
-
     rig = rig_of_day()
     written(rig, tmp_path / "1.json", 0)
     assert rig.cam_from_rig
