@@ -32,6 +32,7 @@ GROUP_OF_SHAPE: dict[str, Group] = {
     "corner": "distortion", "corner_x": "distortion", "corner_y": "distortion",
 }  # fmt: skip
 METRES = "m"
+NOTHING_PX = 1e-6  # of an effect in the corners: rounding of numeric derivatives
 ROUNDING = 1e-12  # of the variances that cancel in a baseline that is the unit
 
 
@@ -248,9 +249,13 @@ def _of_lens(side: Stated, camera: Camera, wide: bool) -> Iterator[Number]:
     cov = by_params @ cross_covariance(side.covariance, names, names) @ by_params.T
     for name, value, variance in zip(SHAPE_NAMES, values, np.diag(cov), strict=True):
         group = GROUP_OF_SHAPE[name]
-        if np.isfinite(value) and (group != "distortion" or camera.size != NO_SIZE):
-            sigma = float(max(variance, 0.0)) ** 0.5 if stated else None
-            yield Number(f"{camera.name}.{name}", group, float(value), sigma, "px", camera.size)
+        if not np.isfinite(value) or (group == "distortion" and camera.size == NO_SIZE):
+            continue
+        sigma = float(max(variance, 0.0)) ** 0.5
+        if max(abs(float(value)), sigma) < NOTHING_PX:  # of a lens that has no such term
+            value, sigma = 0.0, 0.0
+        spread = sigma if stated else None
+        yield Number(f"{camera.name}.{name}", group, float(value), spread, "px", camera.size)
 
 
 def _of_place(side: Stated, index: int, stated: bool, unit: str, key: object) -> Iterator[Number]:

@@ -39,7 +39,8 @@ def print_history(record: History, console: Console) -> None:
     print_line(
         console,
         "change: since the one before, the largest in combined sigmas, as if the two were "
-        "independent; corner: how far distortion moves the image's corners outwards",
+        "independent (by chance one number in twenty changes by more than 2); corner: how far "
+        "distortion moves the image's corners outwards",
     )
     left = f"; {record.n_older} before --since" if record.n_older else ""
     print_line(

@@ -177,6 +177,7 @@ def test_changes_are_in_combined_sigmas(tmp_path: Path) -> None:
     of_focal = first.covariance.sigma["b.fx"], first.covariance.sigma["b.fy"]
     assert told["b.focal_x"].sigma == pytest.approx(of_focal[0], rel=1e-6)
     assert told["b.focal"].change == pytest.approx(0.25)
+    assert told["b.corner_x"].sigma == 0.0 and told["b.corner_x"].z is None  # it has no p1, p2
 
 
 def test_another_reference_is_the_same_rig(tmp_path: Path) -> None:

@@ -126,6 +126,9 @@ def history_figure(record: History, group: Group, camera: str | None) -> go.Figu
                 and not one.name.endswith(".focal")
             ):
                 traces.setdefault(one.name, []).append((entry, one))
+    traces = {
+        n: points for n, points in traces.items() if any(q.value or q.sigma for _, q in points)
+    }
     if not traces:
         return None
     figure = go.Figure()
