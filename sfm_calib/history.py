@@ -105,7 +105,8 @@ def history_of(folder: Path, options: HistoryOptions | None = None) -> History:
             )
     reference = _reference(listed)
     listed, of_sizes = _with_sizes(listed)
-    numbers = [tuple(_numbers(one, reference, _is_wide(listed), options)) for one in listed]
+    wide = _wide(listed)
+    numbers = [tuple(_numbers(one, reference, wide, options)) for one in listed]
     newest = _newest_keys(numbers)
     so_far = Compared()
     entries = []
@@ -212,21 +213,24 @@ def _is_rig(read: CameraRig) -> bool:
     return read.cam_from_rig is not None and len(read.cameras) > 1
 
 
-def _is_wide(listed: Sequence[FoundCalibration]) -> bool:
-    return any(LENSES[c.lens].wide for one in listed for c in one.read.cameras)
+def _wide(listed: Sequence[FoundCalibration]) -> frozenset[str]:
+    """Cameras to which some calibration gives a lens that sees sideways."""
+    cameras = (camera for one in listed for camera in one.read.cameras)
+    return frozenset(camera.name for camera in cameras if LENSES[camera.lens].wide)
 
 
 # ---- numbers -------------------------------------------------------------------------------
 
 
 def _numbers(
-    one: FoundCalibration, reference: str | None, wide: bool, options: HistoryOptions
+    one: FoundCalibration, reference: str | None, wide: frozenset[str], options: HistoryOptions
 ) -> Iterator[Number]:
     side = stated_of(one.read)
     wanted = options.camera or one.read.names
     for camera in side.estimate.cameras:
         if camera.name in wanted:
-            yield from (n for n in _of_lens(side, camera, wide) if n.group in options.parameters)
+            own = _of_lens(side, camera, camera.name in wide)
+            yield from (n for n in own if n.group in options.parameters)
     if not _is_rig(one.read):
         return
     unit, key = _unit(one)
