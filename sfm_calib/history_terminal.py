@@ -42,12 +42,14 @@ def print_history(record: History, console: Console) -> None:
         "independent (by chance one number in twenty changes by more than 2); corner: how far "
         "distortion moves the image's corners outwards",
     )
-    left = f"; {record.n_older} before --since" if record.n_older else ""
-    print_line(
-        console,
-        f"{len(record.entries)} calibrations in {record.folder}{left}; {record.n_skipped} files "
-        "skipped: no calibrations",
-    )
+    print_line(console, f"{len(record.entries)} calibrations in {record.folder}{left_out(record)}")
+
+
+def left_out(record: History) -> str:
+    """What else was found, in words."""
+    older = f"; {record.n_older} before --since" if record.n_older else ""
+    files = "1 file" if record.n_skipped == 1 else f"{record.n_skipped} files"
+    return f"{older}; {files} skipped: no calibration" if record.n_skipped else older
 
 
 def _listed(record: History) -> Table:

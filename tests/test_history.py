@@ -287,7 +287,15 @@ def test_the_command_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFix
     out = tmp_path / "out"
     assert main(["history", str(tmp_path / "rig"), "-o", str(out), "--camera", "a", "b"]) == 0
     text = capsys.readouterr().out
-    for part in ("#2", "1.json", "2026-01-02", "usable", "a to b", "0 files skipped", "rot x deg"):
+    for part in (
+        "#2",
+        "1.json",
+        "2026-01-02",
+        "usable",
+        "a to b",
+        "2 calibrations in",
+        "rot x deg",
+    ):
         assert part in text
     assert "…" not in text
     record = History.model_validate_json((out / "history.json").read_text())

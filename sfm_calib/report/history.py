@@ -13,6 +13,7 @@ from plotly.offline import get_plotlyjs
 
 from sfm_calib.files import write_atomically
 from sfm_calib.history_record import Group, History, HistoryEntry, Quantity
+from sfm_calib.history_terminal import left_out
 from sfm_calib.report.digits import decimals_for, number
 from sfm_calib.report.theme import (
     Panel,
@@ -84,6 +85,7 @@ def render_history(record: History) -> str:
         rows=[row for entry in record.entries for row in _cells(entry)],
         changes={entry.number: _largest(entry) for entry in record.entries},
         alarm_z=ALARM_Z,
+        left_out=left_out(record),
         plotly_js=Markup(get_plotlyjs()),
     )
 
