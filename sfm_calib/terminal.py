@@ -98,7 +98,11 @@ def print_result(calibration: Calibration, console: Console) -> None:
         print_line(
             console,
             f"{name}: {camera.lens}, {camera.size[0]} x {camera.size[1]} px, "
-            f"{camera.n_images} images, {camera.n_observations} observations",
+            + (
+                "not in the scan: kept as the old calibration has it"
+                if camera.kept_from
+                else f"{camera.n_images} images, {camera.n_observations} observations"
+            ),
         )
         table = table_of("", "value", "sigma", "of noise alone", "from priors", "")
         for parameter in PARAMETER_NAMES[camera.lens]:

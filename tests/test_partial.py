@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from synthetic.cameras import camera_of
 
 from graphs.compare import Stated
@@ -22,8 +24,10 @@ from sfm_calib.formats.ours import rig_of
 from sfm_calib.formats.reading import NOTHING
 from sfm_calib.partial import Completed, completed, in_longest_baseline, stated_of, with_missing
 from sfm_calib.recalibration_record import OldCalibration, Recalibration
+from sfm_calib.report.rows import camera_tables
 from sfm_calib.result import CameraResult, CamFromRig, Verdict, load_calibration, save_calibration
 from sfm_calib.result import Covariance as CovarianceResult
+from sfm_calib.terminal import print_result
 
 NAMES = ("a", "b", "c", "d")
 CENTRES = ((0.0, 0.0, 0.0), (0.3, 0.02, 0.0), (0.1, -0.2, 0.05), (-0.2, 0.1, 0.1))
@@ -277,6 +281,11 @@ def test_a_result_with_kept_cameras_is_written_marked(tmp_path: Path) -> None:
     assert read.cameras["a"].params == old.cameras[0].named()
     assert read.rig.reference == "b" and read.verdict
     assert "a, d not in the scan" in read.verdict.messages[-1]
+    captions = {table.name: table.caption for table in camera_tables(read)}
+    assert "kept as the old" in captions["a"] and "kept as the old" not in captions["b"]
+    console = Console(file=StringIO(), width=100)
+    print_result(read, console)
+    assert "d: radial, 640 x 480 px, not in the scan: kept" in console.file.getvalue()
     found = with_missing(rig_of(new, Path("new")), old)
     np.testing.assert_allclose(read.covariance.matrix, found.stated.covariance.matrix)
     angle = read.rig.cam_from_rig["d"].sigma_rotation_deg[0]
