@@ -44,6 +44,7 @@ from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.convert_command import Convert, run_convert
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
+from sfm_calib.history_command import HistoryCommand, run_history
 from sfm_calib.images import camera_names, check_exists
 from sfm_calib.provenance import now
 from sfm_calib.report import TruthRow, write_report
@@ -74,6 +75,7 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Convert, tyro.conf.subcommand("convert")]
+        | Annotated[HistoryCommand, tyro.conf.subcommand("history")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Undistort, tyro.conf.subcommand("undistort")]
         | Annotated[Rectify, tyro.conf.subcommand("rectify")]
@@ -142,6 +144,9 @@ def run(command: Command, arguments: Sequence[str]) -> None:
             run_compare(command)
     elif isinstance(command, Convert):
         run_convert(command)
+    elif isinstance(command, HistoryCommand):
+        with output_folder(command.out) if command.out else nullcontext():
+            run_history(command)
     elif isinstance(command, Check):
         run_check(command, arguments)
     elif isinstance(command, Undistort):

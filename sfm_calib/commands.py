@@ -12,6 +12,7 @@ from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.convert_command import Convert
+from sfm_calib.history_command import HistoryCommand
 from sfm_calib.simulate.scan import SimulateOptions
 from sfm_calib.simulate.tracks import TrackOptions
 from sfm_calib.undistort_command import Rectify, Undistort
@@ -143,6 +144,6 @@ class BoardCommand:
 
 
 Command = (
-    Calibrate | Target | Compare | Convert | BoardCommand | Check | Undistort | Rectify
-    | Simulate | SimulateTracks | Demo
+    Calibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
+    | Undistort | Rectify | Simulate | SimulateTracks | Demo
 )  # fmt: skip

@@ -75,10 +75,10 @@ def with_missing(new: CameraRig, old: CameraRig, unmoved: Sequence[str] | None =
         )
     of_old = reference_of(old)
     reference = of_old if of_old in new.names else ties[0]
-    sides = tuple(_seen_from(stated_of(read), ties[0]) for read in (old, new))
+    sides = tuple(seen_from(stated_of(read), ties[0]) for read in (old, new))
     pair = _scale_pair(new, old, sides[0], ties) if kept else None
     stated, scale = _joined(sides[0], sides[1], kept, pair, new.unit == "m")
-    stated = _ordered(_seen_from(stated, reference), (*old.names, *added))
+    stated = _ordered(seen_from(stated, reference), (*old.names, *added))
     unit = new.unit if not kept else "m" if pair and new.unit == "m" else old.unit
     if unit == "baseline":
         stated = in_longest_baseline(stated)
@@ -120,7 +120,7 @@ def _is_frame(placed: Transform) -> bool:
     return bool((placed.rotation == np.eye(3)).all() and not placed.translation.any())
 
 
-def _seen_from(side: Stated, name: str) -> Stated:
+def seen_from(side: Stated, name: str) -> Stated:
     """In the frame of a camera; as it is, to the bit, where it is in that frame already."""
     index = [camera.name for camera in side.estimate.cameras].index(name)
     held = set(pose_names(name)).isdisjoint(side.covariance.names)

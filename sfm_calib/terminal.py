@@ -85,9 +85,9 @@ class ResultConsole(Console):
         raise BrokenPipeError
 
 
-def result_console() -> Console:
+def result_console(piped_width: int = PIPED_WIDTH) -> Console:
     """Stdout; names are printed as they are, whatever brackets or colons they hold."""
-    width = None if sys.stdout.isatty() else PIPED_WIDTH
+    width = None if sys.stdout.isatty() else piped_width
     return ResultConsole(width=width, markup=False, emoji=False, highlight=False)
 
 
