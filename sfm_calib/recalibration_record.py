@@ -14,7 +14,7 @@ PriorMode = Literal["start", "weak", "full"]
 DriftVerdict = Literal["keep", "replace", "inconclusive"]
 
 
-class OldCalibration(Replaced):
+class OldFile(Replaced):
     """The calibration that it started from."""
 
     format: str  # in words
@@ -34,7 +34,7 @@ class Contribution(Record):
 class Recalibration(Record):
     """From which calibration, how far it was believed, and what it contributed."""
 
-    old: OldCalibration
+    old: OldFile
     prior: PriorMode
     freed: tuple[str, ...]  # what was estimated anew, in words
     kept: tuple[str, ...] = ()  # cameras that the scan lacks: OLD's values, untouched
