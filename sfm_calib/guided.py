@@ -8,7 +8,7 @@ how the rig came out: one that is wrong costs matches at the first step and none
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,12 +33,10 @@ from sfm_calib.images import Progress, Scan
 from sfm_calib.line_matching import match_pairs, sight_of
 from sfm_calib.mapping import (
     DATABASE,
-    ENOUGH_REGISTERED,
     MIN_MATCHES,
     Mapped,
     check_overlap,
     map_matched,
-    map_scan,
     problem_of,
     reference_of,
 )
@@ -81,7 +79,9 @@ def map_with_prior(
     models = cache.stage(
         "guided_models",
         inputs,
-        lambda to: run_apart(_map_coarsely, (scan, config, lenses, known, nominal, place, to), progress),
+        lambda to: run_apart(
+            _map_coarsely, (scan, config, lenses, known, nominal, place, to), progress
+        ),
     )
     found = features.load(place)
     scales = {i.path: f.scales for i, f in zip(scan.images, found, strict=True)}
@@ -132,9 +132,7 @@ def _map_coarsely(
     map_matched(scan, config, rig, database, place, progress)
 
 
-def _overlapping(
-    scan: Scan, known: dict[int, Camera], nominal: dict[int, Transform]
-) -> np.ndarray:
+def _overlapping(scan: Scan, known: dict[int, Camera], nominal: dict[int, Transform]) -> np.ndarray:
     """Whether cameras (n, n) see the same things at one time; those unknown to old may."""
     n = len(scan.cameras)
     overlapping = np.ones((n, n), dtype=bool)

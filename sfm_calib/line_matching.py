@@ -49,7 +49,9 @@ def sight_of(camera: Camera, features: Features) -> Sight:
 
 
 def match_pairs(
-    sights: Sequence[Sight | None], cam_from_world: Sequence[Transform | None], pairs: Sequence[Pair]
+    sights: Sequence[Sight | None],
+    cam_from_world: Sequence[Transform | None],
+    pairs: Sequence[Pair],
 ) -> Iterator[IntArray]:
     """Matches (n, 2) of each pair of images in turn, indices of their features.
 

@@ -1,4 +1,4 @@
-"""The old calibration of a rig, as a scan of it is given one: its names, units, sizes and sigmas."""
+"""The old calibration of a rig, in a scan's terms: names, units, image sizes and sigmas."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class OldCalibration:
         return tuple(name for name in names if name in self.rig.names)
 
     def reference(self, names: Sequence[str]) -> str:
-        """Whose frame is the rig's in a scan of these cameras: its own reference, if it is there."""
+        """Whose frame is the rig's in a scan of these cameras: its own reference's, if there."""
         own = reference_of(self.rig)
         return own if own in names else self.common(names)[0]
 

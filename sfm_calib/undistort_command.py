@@ -74,7 +74,7 @@ class Rectify:
 
 
 def run_undistort(command: Undistort, told: str) -> None:
-    """Write and print; OUT has to be there (`cli.output_folder`)."""
+    """Write and print; OUT has to be there (`output.output_folder`)."""
     rig = read_calibration(command.calibration)
     with progress_bars() as progress:
         done = undistort(
@@ -107,7 +107,7 @@ def line_of(remade: Remade) -> str:
 
 
 def run_rectify(command: Rectify, told: str) -> None:
-    """Write and print; OUT has to be there (`cli.output_folder`)."""
+    """Write and print; OUT has to be there (`output.output_folder`)."""
     rig = read_calibration(command.calibration)
     with progress_bars() as progress:
         done = rectify(
