@@ -42,7 +42,7 @@ class Undistort:
     """An image, a video, a folder of either, or a folder with a sub-folder per camera."""
     out: Out
     """Folder for the new images."""
-    camera: str | None = None
+    camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """The calibration's camera that took everything; default: the only one, or by folder name."""
     options: Annotated[ViewOptions, tyro.conf.arg(name="")] = field(default_factory=ViewOptions)
     overwrite: bool = False
