@@ -9,7 +9,7 @@ believed, not held, reaches the result through the rows that say so, A: by M A' 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from graphs.build import CalibrationGraph
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray
+from graphs.jackknife import change
 from graphs.joint_prior import cameras_of, offset, parameters, whitening
 from graphs.model_covariance import ModelCovariance, calibration_columns, response_at
 from graphs.problem import Estimate, PriorRig
@@ -99,6 +100,28 @@ def cov_difference(stated: Covariance, how: Sensitivity, old: Covariance) -> Cov
     apart = how.by_old[both] - np.array([[float(a == b) for b in how.old] for a in names])
     before = cross_covariance(old, how.old, how.old)
     return Covariance(names, _own(stated, how)[np.ix_(both, both)] + apart @ before @ apart.T)
+
+
+def change_from(prior: PriorRig, in_unit: Estimate, names: tuple[str, ...]) -> FloatArray:
+    """The result's parameters `names` (n,) less the earlier calibration's, of cameras of both.
+
+    in_unit: the result in its own unit, which has to be the prior's. A baseline that is the unit
+    turns on a sphere: what takes it off the plane of its covariance is left out.
+    """
+    indices = cameras_of(prior, in_unit)
+    now = Estimate(
+        tuple(in_unit.cameras[i] for i in indices),
+        tuple(in_unit.cam_from_rig[i] for i in indices),
+        (),
+        in_unit.points,
+    )
+    before = replace(now, cameras=prior.cameras, cam_from_rig=prior.cam_from_rig)
+    moved = change(before, now, names)
+    if prior.metric or prior.unit is None or f"{prior.unit}.translation_x" not in names:
+        return moved
+    far = [camera.name for camera in prior.cameras].index(prior.unit)
+    along: FloatArray = unit_jacobian(names, before, far) @ moved
+    return along
 
 
 def _own(stated: Covariance, how: Sensitivity) -> FloatArray:

@@ -144,6 +144,6 @@ class BoardCommand:
 
 
 Command = (
-    Calibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check | Undistort
-    | Rectify | Simulate | SimulateTracks | Demo
+    Calibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
+    | Undistort | Rectify | Simulate | SimulateTracks | Demo
 )  # fmt: skip

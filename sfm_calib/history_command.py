@@ -35,7 +35,7 @@ class HistoryCommand:
 
 
 def run_history(command: HistoryCommand) -> None:
-    """List, write and print; OUT has to be there (`cli.output_folder`).
+    """List, write and print; OUT has to be there (`output.output_folder`).
 
     Raises CalibrationError as `history_of`, and where OUT cannot be written.
     """

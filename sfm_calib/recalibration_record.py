@@ -10,7 +10,7 @@ from sfm_calib.provenance import Replaced
 from sfm_calib.record import Record
 
 
-class OldCalibration(Replaced):
+class OldFile(Replaced):
     """The calibration that it started from."""
 
     format: str  # in words
@@ -30,7 +30,7 @@ class Contribution(Record):
 class Recalibration(Record):
     """From which calibration, how far it was believed, and what it contributed."""
 
-    old: OldCalibration
+    old: OldFile
     prior: PriorMode  # OLD as the start alone, a weak belief, or with all that it states
     freed: tuple[str, ...]  # what was estimated anew, in words
     kept: tuple[str, ...] = ()  # cameras that the scan lacks: OLD's values, untouched

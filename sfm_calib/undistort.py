@@ -64,8 +64,9 @@ def undistort(
     pairs = sources.match(found, rig.names, chosen)
     cameras = {name: rig.cameras[rig.names.index(name)] for name, _ in pairs}
     lone = rig.cam_from_rig is None and len(cameras) > 1
-    results = [out / (f"calibration_{name}.json" if lone else RESULT) for name in cameras]
-    results = list(dict.fromkeys(results))
+    new = [name for name in rig.names if name in cameras]
+    groups = [[name] for name in new] if lone else [new]
+    results = [out / f"calibration_{plain(name)}.json" for name in new] if lone else [out / RESULT]
     maps = [maps_path(out, name) for name in cameras] if options.maps else []
     places = sources.targets(found, out, [*results, *maps], [rig.path], overwrite)
     read, told = sources.measured([source for _, source in pairs], progress)
@@ -82,17 +83,20 @@ def undistort(
         )
         for (name, _), source in zip(pairs, read, strict=True)
     )  # fmt: skip
-    new = {name: virtual[name] for name in rig.names if name in virtual}
-    groups = [[name] for name in new] if lone else [list(new)]
     for path, names in zip(results, groups, strict=True):
-        kept = virtual_rig(rig, [new[name] for name in names], "undistort")
+        kept = virtual_rig(rig, [virtual[name] for name in names], "undistort")
         save_calibration(with_origin(kept, rig, command), path)
     return Undistorted(remade, (*results, *maps), (*rig.notes, *told))
 
 
 def maps_path(out: Path, name: str) -> Path:
     """Where the maps of a camera go."""
-    return out / f"maps_{name.replace('/', '_')}.npz"
+    return out / f"maps_{plain(name)}.npz"
+
+
+def plain(name: str) -> str:
+    """A camera's name as part of a file's."""
+    return name.replace("/", "_")
 
 
 def of_size(camera: Camera, source: Source, rig: CameraRig) -> Camera:

@@ -42,7 +42,7 @@ class Undistort:
     """An image, a video, a folder of either, or a folder with a sub-folder per camera."""
     out: Out
     """Folder for the new images."""
-    camera: str | None = None
+    camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """The calibration's camera that took everything; default: the only one, or by folder name."""
     options: Annotated[ViewOptions, tyro.conf.arg(name="")] = field(default_factory=ViewOptions)
     overwrite: bool = False
@@ -74,7 +74,7 @@ class Rectify:
 
 
 def run_undistort(command: Undistort, told: str) -> None:
-    """Write and print; OUT has to be there (`cli.output_folder`)."""
+    """Write and print; OUT has to be there (`output.output_folder`)."""
     rig = read_calibration(command.calibration)
     with progress_bars() as progress:
         done = undistort(
@@ -107,7 +107,7 @@ def line_of(remade: Remade) -> str:
 
 
 def run_rectify(command: Rectify, told: str) -> None:
-    """Write and print; OUT has to be there (`cli.output_folder`)."""
+    """Write and print; OUT has to be there (`output.output_folder`)."""
     rig = read_calibration(command.calibration)
     with progress_bars() as progress:
         done = rectify(

@@ -34,7 +34,9 @@ FOV_REMEDY = "say how much to show with --fov, as --fov 110"
 class ViewOptions:
     """What the new images show, and how they are made."""
 
-    view: Literal["inside", "whole", "keep"] | None = None
+    view: Annotated[
+        Literal["inside", "whole", "keep"] | None, tyro.conf.arg(metavar="{inside,whole,keep}")
+    ] = None
     """inside: as much as fits without black pixels (default); whole: all that the camera sees;
     keep: the focal length and principal point as they are."""
     fov: Annotated[float | None, tyro.conf.arg(metavar="DEG")] = None

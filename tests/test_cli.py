@@ -82,7 +82,10 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"sfm-calib {sfm_calib.__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["calibrate", "history", "simulate", "simulate-tracks", "demo"])
+@pytest.mark.parametrize(
+    "command",
+    ["calibrate", "history", "undistort", "rectify", "simulate", "simulate-tracks", "demo"],
+)
 def test_every_flag_is_explained(capsys, command):
     with pytest.raises(SystemExit) as caught:
         main([command, "--help"])

@@ -23,7 +23,7 @@ from sfm_calib.history import HistoryOptions, history_of
 from sfm_calib.history_record import History, HistoryEntry, Quantity
 from sfm_calib.partial import stated_of
 from sfm_calib.provenance import Provenance, Replaced
-from sfm_calib.recalibration_record import OldCalibration, Recalibration
+from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.history import render_history
 from sfm_calib.result import Calibration, save_calibration
 
@@ -99,7 +99,7 @@ def test_what_replaces_what_is_known_by_hash(tmp_path: Path) -> None:
     old = calibration_sha256(tmp_path / "first.json")
     (tmp_path / "first.json").rename(tmp_path / "moved.json")
     recalibration = Recalibration(
-        old=OldCalibration(path="first.json", sha256=old, format="ours"),
+        old=OldFile(path="first.json", sha256=old, format="ours"),
         prior="full", freed=("everything",), kept=("d",), drift="replace",
     )  # fmt: skip
     made = result_of(rig_of_day(1), "a")

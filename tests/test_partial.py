@@ -23,7 +23,7 @@ from sfm_calib.formats import CameraRig, LengthUnit
 from sfm_calib.formats.ours import rig_of
 from sfm_calib.formats.reading import NOTHING
 from sfm_calib.partial import Completed, completed, in_longest_baseline, stated_of, with_missing
-from sfm_calib.recalibration_record import OldCalibration, Recalibration
+from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.rows import camera_tables
 from sfm_calib.result import CameraResult, CamFromRig, Verdict, load_calibration, save_calibration
 from sfm_calib.result import Covariance as CovarianceResult
@@ -266,7 +266,7 @@ def test_a_result_with_kept_cameras_is_written_marked(tmp_path: Path) -> None:
     old = uncertain(true_rig(NAMES, "a"), "a", 1)
     new = result_of(uncertain(true_rig(("b", "c"), "b"), "b", 2), "b")
     record = Recalibration(
-        old=OldCalibration(path="old.json", sha256="a" * 64, format="made"),
+        old=OldFile(path="old.json", sha256="a" * 64, format="made"),
         prior="start", freed=("everything",),
     )  # fmt: skip
     whole = completed(new, old, record)
@@ -297,7 +297,7 @@ def test_a_lone_camera_takes_olds_metres() -> None:
     alone = result_of(uncertain(true_rig(("a",), "a"), "a", 2), "a")
     new = alone.model_copy(update={"rig": alone.rig.model_copy(update={"metric": False})})
     record = Recalibration(
-        old=OldCalibration(path="old.json", sha256="a" * 64, format="made"),
+        old=OldFile(path="old.json", sha256="a" * 64, format="made"),
         prior="full", freed=("intrinsics",),
     )  # fmt: skip
     rig = completed(new, old, record).rig

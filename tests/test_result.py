@@ -10,7 +10,7 @@ from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
 from sfm_calib.provenance import Provenance, Replaced
-from sfm_calib.recalibration_record import Contribution, OldCalibration, Recalibration
+from sfm_calib.recalibration_record import Contribution, OldFile, Recalibration
 from sfm_calib.result import (
     Calibration,
     LensChoice,
@@ -136,7 +136,7 @@ def test_what_is_not_a_number_is_not_written():
 # ---- of a recalibration --------------------------------------------------------------------
 
 HASH = "0" * 63 + "f"
-OLD = OldCalibration(path="old.yaml", sha256=HASH, format="Kalibr")
+OLD = OldFile(path="old.yaml", sha256=HASH, format="Kalibr")
 
 
 def recalibrated():
