@@ -195,20 +195,25 @@ class Summary:
 
 def summarise(case: Case, trials: Sequence[Trial]) -> Summary:
     """Shares over all trials of a case."""
-    said = [one.verdict for one in trials]
     allowed = [one for one in trials if one.power >= Criteria().power]
+
+    def share(verdict: Verdict, of: Sequence[Trial] = trials) -> float:
+        return float(np.mean([one.verdict == verdict for one in of])) if of else 0.0
+
     return Summary(
-        case.rig,
-        case.change,
-        len(trials),
-        *(said.count(verdict) / len(trials) for verdict in ("replace", "keep", "inconclusive")),
-        float(np.mean([one.named for one in trials])),
-        float(np.mean([one.among for one in trials])),
-        float(np.median([one.detectable_px for one in trials])),
-        _commonest([one.worst for one in trials]),
-        _commonest([one.found for one in trials]),
-        len(allowed),
-        float(np.mean([one.verdict == "replace" for one in allowed])) if allowed else 0.0,
+        rig=case.rig,
+        change=case.change,
+        trials=len(trials),
+        replace=share("replace"),
+        keep=share("keep"),
+        inconclusive=share("inconclusive"),
+        named=float(np.mean([one.named for one in trials])),
+        among=float(np.mean([one.among for one in trials])),
+        detectable_px=float(np.median([one.detectable_px for one in trials])),
+        worst=_commonest([one.worst for one in trials]),
+        found=_commonest([one.found for one in trials]),
+        allowed=len(allowed),
+        replace_allowed=share("replace", allowed),
     )
 
 
