@@ -218,12 +218,17 @@ def test_rig_configs_that_say_less(tmp_path: Path) -> None:
     rig[0]["cameras"][1]["image_prefix"] = "left/"
     written(path, json.dumps(rig))
     assert "one image_prefix" in refused(path)
+    rig[0]["cameras"][1]["image_prefix"] = "x" * 1000
+    written(path, json.dumps(rig))
+    assert "longer than 200" in refused(path)
 
 
 def test_a_rig_config_of_another_calibration_names_nothing(tmp_path: Path) -> None:
     exported(COLMAP.write(three("radtan", "radtan", "radtan")), COLMAP, tmp_path)
     other = COLMAP.write(three("radtan", "brown", "radtan")).files["rig_config.json"].decode()
-    for text in (other, "[", "[1]", "{}"):
+    longer = json.loads(COLMAP.write(three("radtan", "radtan", "radtan")).files["rig_config.json"])
+    longer[0]["cameras"][0]["camera_params"][0] += 1e-9
+    for text in (other, json.dumps(longer), "[", "[1]", "{}"):
         written(tmp_path / "rig_config.json", text)
         again = read_calibration(tmp_path)
         assert again.names == ("camera1", "camera2", "camera3")
