@@ -70,6 +70,8 @@ def test_colmap_files_that_cannot_be(tmp_path: Path) -> None:
     assert "has 1 numbers, not 8" in refused(tmp_path)
     written(path, "1 OPENCV 640\n")
     assert "no whole COLMAP model" in refused(tmp_path)
+    written(path, "9" * 50 + " PINHOLE 640 480 500 500 320 240\n")
+    assert "no number of a camera" in refused(tmp_path)
     for bad in ("nan 500 320 240", "-500 500 320 240"):
         written(path, f"1 PINHOLE 640 480 {bad}\n")
         assert "not finite" in refused(tmp_path) or "not positive" in refused(tmp_path)

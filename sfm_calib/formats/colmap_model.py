@@ -42,6 +42,7 @@ MODELS: dict[int, tuple[str, str]] = {
 # Models that our own mapping never writes; equidistant, as kannala_brandt with few coefficients.
 FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 LONGEST_REASON = 100  # characters: it may quote the file
+LARGEST_ID = 2**32 - 1
 CAMERA_SENSOR = 0  # in binary; in text CAMERA
 
 
@@ -129,6 +130,8 @@ def _rows(path: Path) -> Iterator[list[str]]:
 
 def _text_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
     for number, model, width, height, *values in _rows(folder / "cameras.txt"):
+        if not 0 <= int(number) <= LARGEST_ID:
+            raise ValueError(f"{number[:20]} is no number of a camera")
         name = f"camera{int(number)}"
         size = image_size(f"{folder}: {name}", width, height)
         params = [float(value) for value in values]

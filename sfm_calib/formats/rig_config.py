@@ -18,6 +18,7 @@ from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats.bounded import bounded_bytes
 from sfm_calib.formats.colmap_model import model_camera, read_colmap
+from sfm_calib.formats.contents import LONGEST_NAME
 from sfm_calib.formats.numbers import numbers
 from sfm_calib.formats.reading import NO_SIZE, CameraRig
 
@@ -50,6 +51,8 @@ def read_rig_config(path: Path, content: list[Any]) -> CameraRig:
     ):
         raise CalibrationError(f"{path}: its rig has no list of cameras with an image_prefix each")
     names = [entry["image_prefix"].removesuffix("/") for entry in entries]
+    if any(len(name) > LONGEST_NAME for name in names):
+        raise CalibrationError(f"{path}: an image_prefix is longer than {LONGEST_NAME} characters")
     if len(set(names)) < len(names):
         raise CalibrationError(f"{path}: two of its {len(names)} cameras have one image_prefix")
     pairs = list(zip(names, entries, strict=True))
