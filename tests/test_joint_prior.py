@@ -294,7 +294,7 @@ def test_its_share_is_one_where_the_data_say_nothing() -> None:
     for name, sigma in zip(found.model.names, after, strict=True):
         assert sigma == pytest.approx(before[name], rel=0.1), name
     by_variance = prior_shares(found.model.covariance, information)
-    assert by_variance["cam0.fx"] > 0.99 and by_variance["cam2.k1"] < 1e-3
+    assert by_variance["cam0.fx"] > 0.99
     in_unit = shares_of_prior(earlier(metric=False), found.model.covariance, True)
     assert not any(".translation_" in name for name in in_unit)
 

@@ -8,18 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from synthetic.earlier import NAMES, old, scan
+from synthetic.scans import silent
 
 from graphs.covariance import Covariance
 from graphs.frames import Transform
 from graphs.pose_covariance import rereferenced
-from graphs.problem import Estimate
+from graphs.problem import Estimate, PriorMode
 from graphs.propagation import lens_names, marginal, pose_names
-from sfm_calib.calibrate import options_of
+from sfm_calib.calibrate import Stopwatch, determine, options_of
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, NOTHING, CameraRig
-from sfm_calib.nominal import lens_priors
+from sfm_calib.formats.reading import NO_SIZE, NOTHING, CameraRig, LengthUnit
+from sfm_calib.images import Scan
+from sfm_calib.mapping import Mapped
+from sfm_calib.nominal import lens_priors, start_from_config
 from sfm_calib.prior import checked, freed, prior_of, started, with_lenses
+from sfm_calib.result import Calibration
+from sfm_calib.run import Given
 
 CAMERAS = old().estimate.cameras
 SIZES = {camera.name: camera.size for camera in CAMERAS}
@@ -198,3 +203,49 @@ def test_one_camera_has_no_place() -> None:
     assert prior.cam_from_rig[0].translation.tolist() == [0, 0, 0] and not prior.gives_scale
     start = Estimate(CAMERAS[:1], (Transform.identity(),), (), np.zeros((0, 3)))
     assert lens_priors(start, RigConfig(), False, prior)[0].mean[0] == CAMERAS[0].params[0]
+
+
+# ---- to a result ----------------------------------------------------------------------------
+
+
+def result_of(mode: PriorMode, free: list[str], unit: LengthUnit = "m") -> Calibration:
+    """A scan's result with the earlier calibration, from a mapping in a unit of its own."""
+    problem, _ = scan()
+    problem = replace(problem, initial=problem.initial.scaled(2.5))
+    config = with_lenses(RigConfig(), read(), NAMES)
+    prior = prior_of(replace(read(), unit=unit), mode, free, NAMES, "cam0")
+    images = Scan(Path(), NAMES, tuple(SIZES.values()), problem.frame_names, ())
+    start = started(start_from_config(problem, config), prior)
+    given = Given(images, config, Mapped(problem, (), {}), "")
+    return determine(given, start, Stopwatch(), silent).calibration
+
+
+def test_a_result_tells_where_its_metres_are_from_and_what_was_believed() -> None:
+    found = result_of("full", ["all"])
+    assert found.rig.metric and "earlier calibration" in found.rig.scale.source
+    assert found.rig.scale.sigma_relative is not None
+    assert 1e-3 < found.rig.scale.sigma_relative < 0.05
+    for name, camera in found.cameras.items():
+        assert set(camera.prior_share) == set(camera.params), name
+        assert all(0.05 < share < 0.95 for share in camera.prior_share.values())
+    assert not [one for one in found.verdict.messages if "contradict" in one]
+
+
+@pytest.mark.parametrize(
+    ("mode", "free", "unit"),
+    [
+        ("weak", ["all"], "m"),
+        ("start", ["rotation"], "m"),
+        ("full", ["cam1"], "baseline"),
+        ("full", ["intrinsics"], "unknown"),
+    ],
+)
+def test_every_mode_leads_to_a_result(mode: PriorMode, free: list[str], unit: LengthUnit) -> None:
+    found = result_of(mode, free, unit)
+    assert found.solve.converged
+    assert found.rig.metric == (mode == "start")
+    free_lens = "intrinsics" in free or "all" in free
+    assert (found.cameras["cam2"].sigma["fx"] > 0) == free_lens
+    if not free_lens:
+        assert found.cameras["cam2"].params["fx"] == CAMERAS[2].params[0]
+        assert found.cameras["cam2"].prior_share["fx"] == 1
