@@ -30,6 +30,7 @@ from graphs.unit import unit_jacobian
 class Sensitivity:
     """How a result follows the earlier calibration that it was held to, or leant on."""
 
+    prior: PriorRig
     names: tuple[str, ...]  # of the result, what was held of the earlier one among them
     old: tuple[str, ...]  # of the earlier one
     by_old: FloatArray  # (n, n_old) what a change of the earlier one does to the result
@@ -68,6 +69,7 @@ def sensitivity(
         by_old[:, held] += (own @ of_held.T) @ whiten.T @ whiten
     kept = [i for i, name in enumerate(every) if name in basis.names or name in prior.held]
     return Sensitivity(
+        prior,
         tuple(every[i] for i in kept),
         old,
         by_old[kept] @ _by_reported(prior),
@@ -79,17 +81,17 @@ def _by_reported(prior: PriorRig) -> FloatArray:
     return offset(prior, [camera.params for camera in prior.cameras], prior.cam_from_rig)[1]
 
 
-def considered(stated: Covariance, how: Sensitivity, old: Covariance) -> Covariance:
+def considered(stated: Covariance, how: Sensitivity) -> Covariance:
     """The solve's stated covariance with all that the earlier calibration's errors do to it.
 
     Held parameters have the covariance that they had, and correlate with what follows them. Those
-    of which `old` states nothing count as exactly known.
+    of which it states nothing count as exactly known.
     """
-    before = cross_covariance(old, how.old, how.old)
+    before = cross_covariance(how.prior.covariance, how.old, how.old)
     return Covariance(how.names, _own(stated, how) + how.by_old @ before @ how.by_old.T)
 
 
-def cov_difference(stated: Covariance, how: Sensitivity, old: Covariance) -> Covariance:
+def cov_difference(stated: Covariance, how: Sensitivity) -> Covariance:
     """Covariance of the result less the earlier calibration, of the parameters of both.
 
     What the result takes from the earlier one cancels: of x = W data + (1 - W) old, the difference
@@ -98,15 +100,18 @@ def cov_difference(stated: Covariance, how: Sensitivity, old: Covariance) -> Cov
     both = [index for index, name in enumerate(how.names) if name in how.old]
     names = tuple(how.names[index] for index in both)
     apart = how.by_old[both] - np.array([[float(a == b) for b in how.old] for a in names])
-    before = cross_covariance(old, how.old, how.old)
-    return Covariance(names, _own(stated, how)[np.ix_(both, both)] + apart @ before @ apart.T)
+    before = cross_covariance(how.prior.covariance, how.old, how.old)
+    matrix = _own(stated, how)[np.ix_(both, both)] + apart @ before @ apart.T
+    plane = _plane(how.prior, names)
+    return Covariance(names, plane @ matrix @ plane.T)
 
 
 def change_from(prior: PriorRig, in_unit: Estimate, names: tuple[str, ...]) -> FloatArray:
     """The result's parameters `names` (n,) less the earlier calibration's, of cameras of both.
 
     in_unit: the result in its own unit, which has to be the prior's. A baseline that is the unit
-    turns on a sphere: what takes it off the plane of its covariance is left out.
+    turns on a sphere: what leads off the plane at the prior's is left out, here and in
+    `cov_difference`.
     """
     indices = cameras_of(prior, in_unit)
     now = Estimate(
@@ -116,12 +121,15 @@ def change_from(prior: PriorRig, in_unit: Estimate, names: tuple[str, ...]) -> F
         in_unit.points,
     )
     before = replace(now, cameras=prior.cameras, cam_from_rig=prior.cam_from_rig)
-    moved = change(before, now, names)
+    return _plane(prior, names) @ change(before, now, names)
+
+
+def _plane(prior: PriorRig, names: tuple[str, ...]) -> FloatArray:
+    """Projection (n, n) of changes onto those that leave the prior's unit as it is."""
     if prior.metric or prior.unit is None or f"{prior.unit}.translation_x" not in names:
-        return moved
-    far = [camera.name for camera in prior.cameras].index(prior.unit)
-    along: FloatArray = unit_jacobian(names, before, far) @ moved
-    return along
+        return np.eye(len(names))
+    rig = Estimate(prior.cameras, prior.cam_from_rig, (), np.zeros((0, 3)))
+    return unit_jacobian(names, rig, [camera.name for camera in prior.cameras].index(prior.unit))
 
 
 def _own(stated: Covariance, how: Sensitivity) -> FloatArray:

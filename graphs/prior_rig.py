@@ -31,7 +31,7 @@ def prior_rig(
     lengths are put into units of the longest baseline whose ends are known, or held.
     """
     names = [camera.name for camera in stated.estimate.cameras]
-    estimate, covariance = rereferenced(stated.estimate, stated.covariance, names.index(reference))
+    estimate, covariance = _seen_from(stated, names.index(reference))
     kept = [names.index(name) for name in cameras if name in names]
     part = Estimate(
         tuple(estimate.cameras[i] for i in kept),
@@ -59,6 +59,32 @@ def prior_rig(
         None if unit is None else part.cameras[unit].name,
         held,
     )
+
+
+def _seen_from(stated: Stated, reference: int) -> tuple[Estimate, Covariance]:
+    """In a camera's frame, without rows of places of which not every part was stated.
+
+    `rereferenced` takes for exactly known what has no row.
+    """
+    estimate, covariance = stated.estimate, stated.covariance
+    placed = estimate.cam_from_rig[reference]
+    if np.array_equal(placed.rotation, np.eye(3)) and not placed.translation.any():
+        return estimate, covariance
+    have = set(covariance.names)
+    known = [
+        set(pose_names(camera.name)) <= have
+        or (np.array_equal(place.rotation, np.eye(3)) and not place.translation.any())
+        for camera, place in zip(estimate.cameras, estimate.cam_from_rig, strict=True)
+    ]
+    seen, moved = rereferenced(estimate, covariance, reference)
+    vague = {
+        name
+        for camera, whole in zip(estimate.cameras, known, strict=True)
+        if not (whole and known[reference])
+        for name in pose_names(camera.name)
+    }
+    kept = [name for name in moved.names if name not in vague]
+    return seen, marginal(moved, kept) if kept else NOTHING
 
 
 _NO_POINTS: FloatArray = np.zeros((0, 3))
