@@ -31,6 +31,7 @@ from sfm_calib.commands import (
     Check,
     Command,
     Demo,
+    Recalibrate,
     Simulate,
     SimulateTracks,
     Target,
@@ -44,6 +45,7 @@ from sfm_calib.files import write_atomically
 from sfm_calib.history_command import HistoryCommand, run_history
 from sfm_calib.images import camera_names, check_exists
 from sfm_calib.output import finish, output_folder, told
+from sfm_calib.recalibrate_command import run_recalibrate
 from sfm_calib.result import load_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.tracks import simulate_tracks, write_tracks
@@ -63,9 +65,13 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
     default = Calibrate(tyro.MISSING, tyro.MISSING, config.options())
     calibrate_type = Annotated[Calibrate, tyro.conf.subcommand("calibrate", default=default)]
     target_default = Target(tyro.MISSING, tyro.MISSING, tyro.MISSING, config.target_options())
+    recalibrate_default = Recalibrate(
+        tyro.MISSING, tyro.MISSING, tyro.MISSING, options=config.options()
+    )
     check_default = Check(tyro.MISSING, None, config.options())
     commands: Any = (
         calibrate_type
+        | Annotated[Recalibrate, tyro.conf.subcommand("recalibrate", default=recalibrate_default)]
         | Annotated[Target, tyro.conf.subcommand("target", default=target_default)]
         | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
@@ -96,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     quiet_decoders()
     try:
-        run(parse(arguments), arguments)
+        return run(parse(arguments), arguments)
     except CalibrationError as error:
         print(f"sfm-calib: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
@@ -126,8 +132,10 @@ def quiet_decoders() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
-def run(command: Command, arguments: Sequence[str]) -> None:
-    """Do what a parsed command asks for."""
+def run(command: Command, arguments: Sequence[str]) -> int:
+    """Do what a parsed command asks for; the exit code."""
+    if isinstance(command, Recalibrate):
+        return run_recalibrate(command, config_of(command.scan, arguments), arguments)
     if isinstance(command, Calibrate):
         run_calibrate(command, arguments)
     elif isinstance(command, Target):
@@ -160,6 +168,7 @@ def run(command: Command, arguments: Sequence[str]) -> None:
         print(f"{len(problem.observations)} observations written to {command.out}")
     else:
         run_demo(command)
+    return 0
 
 
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
@@ -248,7 +257,7 @@ def config_of(scan: Path, arguments: Sequence[str]) -> RigConfig:
     check_exists(scan)
     from_file = load_rig_config(rig_file(scan))
     again = parse(arguments, from_file)
-    assert isinstance(again, Calibrate | Check)
+    assert isinstance(again, Calibrate | Check | Recalibrate)
     return from_file.with_options(again.options)
 
 

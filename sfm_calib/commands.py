@@ -13,6 +13,7 @@ from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.convert_command import Convert
 from sfm_calib.history_command import HistoryCommand
+from sfm_calib.recalibrate_command import Recalibrate
 from sfm_calib.simulate.scan import SimulateOptions
 from sfm_calib.simulate.tracks import TrackOptions
 from sfm_calib.undistort_command import Rectify, Undistort
@@ -144,6 +145,6 @@ class BoardCommand:
 
 
 Command = (
-    Calibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
+    Calibrate | Recalibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
     | Undistort | Rectify | Simulate | SimulateTracks | Demo
 )  # fmt: skip

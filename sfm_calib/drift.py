@@ -23,6 +23,8 @@ from sfm_calib.errors import CalibrationError
 # For scripts and fleets (`--exit-code`). Not 1, which is a crash, nor 2, which is bad input.
 EXIT_STATUS: dict[Verdict, int] = {"keep": 0, "replace": 3, "inconclusive": 4}
 Unit = Literal["m", "baseline"]
+# Two metres before a rig whose cameras sit 5 cm to half a metre apart.
+RANGE: dict[Unit, float] = {"m": Criteria.range, "baseline": 10.0}
 EXACT = Covariance((), np.zeros((0, 0)))
 
 
@@ -39,25 +41,32 @@ class DriftOptions:
     """Chance of finding drift where there is none, in all tests together."""
     old_sigma_px: Annotated[float, tyro.conf.arg(metavar="PX")] = 0.2
     """What an old calibration without a covariance is taken to be right to in the picture, rms."""
-    drift_range: Annotated[float, tyro.conf.arg(metavar="M")] = Criteria.range
-    """Range in m, or in baselines without a scale, at which a moved camera is judged in px."""
+    drift_range: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Range at which a moved camera is judged in px; default: 2 m, or 10 baselines without a
+    scale."""
     depth_ranges: Annotated[tuple[float, ...], tyro.conf.arg(metavar="M")] = Criteria.depth_ranges
     """Ranges of the depths that are compared."""
 
     def __post_init__(self) -> None:
         for name in ("matters_px", "old_sigma_px", "drift_range"):
-            _check(name, getattr(self, name), 0 < getattr(self, name) < np.inf, "positive")
+            value = getattr(self, name)
+            if value is not None:
+                _check(name, value, 0 < value < np.inf, "positive")
         _check("systematic_px", self.systematic_px, 0 <= self.systematic_px < np.inf, "0 or more")
         _check("alpha", self.alpha, 0 < self.alpha < 0.5, "between 0 and 0.5")
         for one in self.depth_ranges:
             _check("depth_ranges", one, 0 < one < np.inf, "positive")
 
-    @property
-    def criteria(self) -> Criteria:
+    def criteria(self, unit: Unit) -> Criteria:
+        """For calibrations in a unit of length."""
         return Criteria(
             self.systematic_px, self.matters_px, self.alpha,
-            range=self.drift_range, depth_ranges=self.depth_ranges,
+            range=self.range(unit), depth_ranges=self.depth_ranges,
         )  # fmt: skip
+
+    def range(self, unit: Unit) -> float:
+        """At which a change of place is judged."""
+        return self.drift_range or RANGE[unit]
 
 
 def _check(name: str, value: float, right: bool, what: str) -> None:
@@ -92,10 +101,10 @@ def judge(
     assumed = not old.covariance.names and cov_difference is None
     if assumed:
         in_first = rereferenced(old.estimate, EXACT, 0)[0]
-        covariance = assumed_covariance(in_first, options.old_sigma_px, options.drift_range)
+        covariance = assumed_covariance(in_first, options.old_sigma_px, options.range(unit))
         old = Stated(in_first, covariance)
     found = drift(
-        old, new, options.criteria,
+        old, new, options.criteria(unit),
         scale_free=scale_free, tested=tested, cov_difference=cov_difference,
     )  # fmt: skip
     said = list(notes)

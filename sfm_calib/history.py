@@ -143,7 +143,7 @@ def _entry(
         when=one.when,
         when_from=one.when_from,
         usable=result.verdict.usable if result and result.verdict else None,
-        drift=recalibration.drift if recalibration else None,
+        drift=recalibration.drift.verdict if recalibration and recalibration.drift else None,
         replaces=_parent(listed, index),
         cameras=one.read.names,
         kept=recalibration.kept if recalibration else (),

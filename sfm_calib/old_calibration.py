@@ -12,6 +12,7 @@ from graphs.compare_rig import pair_place
 from graphs.drift_picture import assumed_covariance
 from sfm_calib.compare_sides import renamed
 from sfm_calib.config import BaselineConfig, RigConfig
+from sfm_calib.drift import EXACT, DriftOptions
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import CameraRig
 from sfm_calib.images import Scan
@@ -19,8 +20,6 @@ from sfm_calib.partial import reference_of, stated_of
 from sfm_calib.prior import checked
 from sfm_calib.uncertainty import Unit
 
-# Where a change of place is judged, and an assumed error: 2 m before a rig of 5 cm to half a metre.
-RANGE: dict[Unit, float] = {"m": 2.0, "baseline": 10.0}
 LEAST_RELATIVE = 1e-6  # sigma of a baseline that a file without sigmas, or a truth, gives
 
 
@@ -35,7 +34,13 @@ class OldCalibration:
 
     @property
     def stated(self) -> Stated:
+        """Its values with the covariance that it states or is assumed to have."""
         return stated_of(self.rig)
+
+    @property
+    def own(self) -> Stated:
+        """With what it states itself: nothing, where its sigmas are assumed."""
+        return Stated(self.stated.estimate, EXACT) if self.assumed else self.stated
 
     def common(self, names: Sequence[str]) -> tuple[str, ...]:
         """Of these cameras, those that it has."""
@@ -70,13 +75,13 @@ class OldCalibration:
 
 
 def old_calibration(
-    read: CameraRig, scan: Scan, cameras: Sequence[str], sigma_px: float
+    read: CameraRig, scan: Scan, cameras: Sequence[str], options: DriftOptions
 ) -> OldCalibration:
     """An old calibration as it was read, for a scan of its rig.
 
-    cameras: `name in OLD=name in the scan`, where the names do not tell. sigma_px: how right a file
-    without sigmas is taken to be, in the picture. Raises CalibrationError where no camera is in
-    both, where image sizes differ, and where it does not say how its cameras sit.
+    cameras: `name in OLD=name in the scan`, where the names do not tell. options: how right a file
+    without sigmas is taken to be. Raises CalibrationError where no camera is in both, where image
+    sizes differ, and where it does not say how its cameras sit.
     """
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
@@ -84,14 +89,11 @@ def old_calibration(
     assumed = not rig.states_sigmas
     if assumed:
         side = stated_of(rig)
-        at = RANGE[unit] if unit else 1.0
         reference = rig.names.index(reference_of(rig))
-        covariance = assumed_covariance(side.estimate, sigma_px, at, reference)
-        rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
-        notes += (
-            f"{read.path} states no sigmas: it is taken as right to {sigma_px:g} px rms in the "
-            "picture (--old-sigma-px)",
+        covariance = assumed_covariance(
+            side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
+        rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
     return OldCalibration(rig, unit, assumed, (*rig.notes, *notes))
 
 

@@ -19,9 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from graphs.compare import Stated
 from graphs.consider import Sensitivity, considered, cov_difference, sensitivity
 from graphs.covariance import Covariance
-from graphs.drift import Drift, drift
 from graphs.drift_picture import Group, lens_columns
-from graphs.drift_tests import Criteria
 from graphs.problem import PriorMode, PriorRig
 from graphs.propagation import lens_names, marginal, pose_names
 from graphs.refine import Refinement
@@ -39,13 +37,15 @@ from sfm_calib.calibrate import (
 )
 from sfm_calib.config import RigConfig
 from sfm_calib.contributions import contributions_of
+from sfm_calib.drift import DriftOptions, Judged, judge
+from sfm_calib.drift_record import DriftRecord
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
 from sfm_calib.guided import map_with_prior
 from sfm_calib.images import Progress
 from sfm_calib.nominal import check_config, start_from_config
-from sfm_calib.old_calibration import RANGE, OldCalibration, old_calibration, with_scale_of
+from sfm_calib.old_calibration import OldCalibration, old_calibration, with_scale_of
 from sfm_calib.partial import completed
 from sfm_calib.prior import prior_of, started, with_lenses
 from sfm_calib.recalibration_record import OldFile, Recalibration
@@ -69,8 +69,6 @@ class RecalibrateOptions(BaseModel):
     """Which cameras are the same, as name in OLD=name in SCAN; default: by name, else by order."""
     metres: Annotated[float | None, tyro.conf.arg(metavar="M"), Field(gt=0)] = None
     """How many metres the unit of OLD's lengths is, where the file does not say (0.001: mm)."""
-    old_sigma_px: Annotated[float, tyro.conf.arg(metavar="PX"), Field(gt=0)] = 0.5
-    """How right OLD is taken to be in the picture (rms), where it states no sigmas."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +76,7 @@ class Recalibrated:
     """The result with all cameras of the rig, and how it differs from the old one."""
 
     outcome: Outcome
-    drift: Drift
-    old: OldCalibration
+    drift: DriftRecord
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ class Solved:
     def stated(self) -> Covariance:
         """What was held counts as uncertain as it was."""
         alone = self.covariance.stated
-        return considered(alone, self.follows, self.prior.covariance) if self.follows else alone
+        return considered(alone, self.follows) if self.follows else alone
 
     @property
     def side(self) -> Stated:
@@ -110,20 +107,20 @@ def recalibrate(
     scan_path: Path,
     config: RigConfig,
     options: RecalibrateOptions,
-    criteria: Criteria,
+    drift: DriftOptions,
     cache: Cache,
     progress: Progress,
     command: str = "",
 ) -> Recalibrated:
     """Test an old calibration by a scan, and calibrate its rig anew.
 
-    As `calibrate`. Raises CalibrationError also where the two have no camera in common.
+    drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the two have no camera in common.
     """
     watch = Stopwatch()
     if options.metres is not None:
         read = read.metric(options.metres)
     scan = checked_scan(scan_path, config, cache, progress, watch)
-    old = old_calibration(read, scan, options.cameras, options.old_sigma_px)
+    old = old_calibration(read, scan, options.cameras, drift)
     has_scale = bool(config.scale.measured)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
@@ -134,9 +131,9 @@ def recalibrate(
         careful: PriorMode = "start" if options.prior == "start" else "weak"
         alone = _solve(given, old, careful, options.free, watch, progress)
         with watch.stage("drift"), refusals():
-            found = _drift(old, alone, criteria, scale_free=not has_scale)
+            found = _drift(old, alone, drift, scale_free=not has_scale)
         best = alone
-        if options.prior == "full" and found.verdict != "replace":
+        if options.prior == "full" and found.record.verdict != "replace":
             best = _solve(given, old, "full", options.free, watch, progress)
     run = Run(
         scan, config, mapped, best.refinement, best.covariance, watch.seconds, command,
@@ -150,11 +147,11 @@ def recalibrate(
         contributions=contributions_of(
             best.prior, best.side, alone.side, best.covariance.model, calibration.rig.metric
         ),
-        drift=found.verdict,
+        drift=found.record,
     )
     calibration = restated(calibration, best.stated)
-    whole = completed(calibration, old.rig, record, _unmoved(found, scan.cameras))
-    return Recalibrated(Outcome(whole, best.refinement, unit), found, old)
+    whole = completed(calibration, old.rig, record, _unmoved(found.record))
+    return Recalibrated(Outcome(whole, best.refinement, unit), found.record)
 
 
 def _with_reference(config: RigConfig, old: OldCalibration, names: Sequence[str]) -> RigConfig:
@@ -195,19 +192,19 @@ def _solve(
     return Solved(refinement, covariance, split, prior, follows)
 
 
-def _drift(old: OldCalibration, new: Solved, criteria: Criteria, scale_free: bool) -> Drift:
+def _drift(old: OldCalibration, new: Solved, options: DriftOptions, scale_free: bool) -> Judged:
     """Of the cameras that both have."""
     names = old.common([camera.name for camera in new.refinement.estimate.cameras])
-    before, after = _part(old.stated, names), _part(new.side, names)
+    before = _part(old.own if new.follows is None else old.stated, names)
+    after = _part(new.side, names)
     apart = None
     if new.follows is not None:
-        apart = cov_difference(new.covariance.stated, new.follows, new.prior.covariance)
-    if old.unit:
-        criteria = replace(criteria, range=RANGE[old.unit])
-    tested = set(_tested(before, new.prior.held))
-    return drift(
-        before, after, criteria, scale_free=scale_free, tested=tested, cov_difference=apart
-    )
+        apart = cov_difference(new.covariance.stated, new.follows)
+    return judge(
+        before, after, old.unit or "m", options,
+        scale_free=scale_free, tested=set(_tested(before, new.prior.held)), cov_difference=apart,
+        notes=old.notes,
+    )  # fmt: skip
 
 
 def _part(side: Stated, names: Sequence[str]) -> Stated:
@@ -244,10 +241,8 @@ def _tested(side: Stated, held: frozenset[str]) -> Iterator[tuple[str, Group]]:
             yield camera.name, "translation"
 
 
-def _unmoved(found: Drift, names: Sequence[str]) -> tuple[str, ...] | None:
+def _unmoved(found: DriftRecord) -> tuple[str, ...] | None:
     """Cameras that kept their places, where it can be told which moved."""
     if len(found.moved) != 1:
         return None
-    cameras = [camera.name for camera in found.old.estimate.cameras]
-    moved = {cameras[index] for index in found.moved[0]}
-    return tuple(name for name in cameras if name not in moved) or None
+    return tuple(name for name in found.cameras if name not in found.moved[0]) or None

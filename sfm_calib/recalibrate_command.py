@@ -13,7 +13,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.colmap import quiet
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import Options, RigConfig
-from sfm_calib.drift import DriftOptions
+from sfm_calib.drift import EXIT_STATUS, DriftOptions
 from sfm_calib.drift_terminal import print_drift
 from sfm_calib.files import refuse_overwrite
 from sfm_calib.formats import read_calibration
@@ -22,8 +22,6 @@ from sfm_calib.output import finish, output_folder, told
 from sfm_calib.recalibrate import RecalibrateOptions, recalibrate
 from sfm_calib.result import load_calibration
 from sfm_calib.terminal import progress_bars, result_console
-
-EXIT_OF_VERDICT = {"keep": 0, "replace": 3, "inconclusive": 4}
 
 
 @dataclass(frozen=True)
@@ -81,4 +79,4 @@ def run_recalibrate(command: Recalibrate, config: RigConfig, arguments: Sequence
             print_drift(done.drift, result_console())
         rows = compare_with_truth(done.outcome.calibration, truth) if truth else []
         finish(done.outcome, command.out, rows, command.json)
-    return EXIT_OF_VERDICT[done.drift.verdict] if command.exit_code else 0
+    return EXIT_STATUS[done.drift.verdict] if command.exit_code else 0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from graphs.drift import Verdict as DriftVerdict
 from graphs.problem import PriorMode
+from sfm_calib.drift_record import DriftRecord
 from sfm_calib.provenance import Replaced
 from sfm_calib.record import Record
 
@@ -36,7 +36,7 @@ class Recalibration(Record):
     kept: tuple[str, ...] = ()  # cameras that the scan lacks: OLD's values, untouched
     added: tuple[str, ...] = ()  # cameras that OLD lacks
     contributions: dict[str, Contribution] = Field(default_factory=dict)  # by parameter
-    drift: DriftVerdict | None = None  # None: not tested
+    drift: DriftRecord | None = None  # None: not tested
 
     @model_validator(mode="after")
     def _no_camera_is_both_kept_and_added(self) -> Recalibration:

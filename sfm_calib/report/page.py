@@ -16,6 +16,7 @@ from sfm_calib.provenance import Provenance
 from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
+from sfm_calib.report.drift import drift_section
 from sfm_calib.report.headline import banner, key_figures, truth_summary
 from sfm_calib.report.image_plane import (
     arrows_figure,
@@ -102,6 +103,7 @@ def render(
     lenses = camera_tables(calibration, truth_rows)
     rig = rig_tables(calibration, truth_rows) if is_rig else ()
     has_covariance = bool(calibration.covariance.names)
+    drift = calibration.recalibration.drift if calibration.recalibration else None
     return page_template("page.html").render(
         title=title,
         calibration=calibration,
@@ -114,6 +116,7 @@ def render(
         rig_tables=rig,
         board=board_section(calibration, problem, estimate),
         scale_ledger=ledger_section(calibration),
+        drift=drift_section(drift) if drift else "",
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
         truth_summary=truth_summary(truth_rows),
