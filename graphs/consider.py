@@ -22,7 +22,7 @@ from graphs.joint_prior import cameras_of, offset, parameters, whitening
 from graphs.model_covariance import ModelCovariance, calibration_columns, response_at
 from graphs.problem import Estimate, PriorRig
 from graphs.propagation import cross_covariance
-from graphs.stated_covariance import factors
+from graphs.stated_covariance import CalibrationCovariance, factors
 from graphs.unit import unit_jacobian
 
 
@@ -89,6 +89,34 @@ def considered(stated: Covariance, how: Sensitivity) -> Covariance:
     """
     before = cross_covariance(how.prior.covariance, how.old, how.old)
     return Covariance(how.names, _own(stated, how) + how.by_old @ before @ how.by_old.T)
+
+
+def completed(covariance: CalibrationCovariance, how: Sensitivity) -> CalibrationCovariance:
+    """All covariances of a solve, as `considered`, with what was held among their names.
+
+    The model's part from data stays what it was; the jackknife moved nothing that was held.
+    """
+    basis, jackknife = covariance.basis, covariance.jackknife
+    place = np.array([[float(a == b) for b in basis.names] for a in how.names])
+    from_data = place @ basis.from_data @ place.T
+    model = considered(basis.covariance, how).matrix
+    basis = replace(
+        basis,
+        names=how.names,
+        from_data=from_data,
+        of_priors=factors(model - from_data)[0].T,
+        response=basis.response @ place.T,
+    )
+    if jackknife is not None:
+        jackknife = replace(
+            jackknife,
+            names=how.names,
+            moved=jackknife.moved @ place.T,
+            expected=place @ jackknife.expected @ place.T,
+        )
+    return CalibrationCovariance(
+        considered(covariance.stated, how), considered(covariance.robust, how), jackknife, basis
+    )
 
 
 def cov_difference(stated: Covariance, how: Sensitivity) -> Covariance:

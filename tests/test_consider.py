@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic.earlier import TRACKS, Solved, drawn, earlier, recalibrated, scan, sigmas
+from synthetic.earlier import TRACKS, Solved, drawn, earlier, options, recalibrated, scan, sigmas
 
 from graphs.consider import change_from, considered, cov_difference, sensitivity
+from graphs.consider import completed as completed_all
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray
 from graphs.jackknife import change, tangent
 from graphs.joint_prior import displaced, exactly_held, offset, parameters
 from graphs.problem import Estimate, PriorMode, PriorRig
 from graphs.propagation import marginal
-from graphs.stated_covariance import factors
+from graphs.refine import refine
+from graphs.stated_covariance import calibration_covariance, factors
+from sfm_calib.prior import started
 
 FREE = ["cam1", "extrinsics", "rotation", "focal cam2.translation"]
 
@@ -123,6 +126,27 @@ def test_what_is_held_stays_where_data_pull_hard() -> None:
     there = prior_of(found)
     left = offset(there, [c.params for c in found.estimate.cameras], found.estimate.cam_from_rig)
     assert np.abs(left[0][held]).max() < 1e-8
+
+
+@pytest.mark.parametrize("free", ["all", "cam1"])
+def test_all_covariances_of_a_solve_are_completed(free: str) -> None:
+    problem = started(scan()[0], earlier(metric=False, free=free))
+    refinement = refine(problem, options(problem), 1.0)
+    graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
+    covariance = calibration_covariance(graph, estimate, values, 1.0)
+    how = sensitivity(graph, estimate, values, covariance.basis)
+    whole = completed_all(covariance, how)
+    assert whole.jackknife is not None and whole.jackknife.names == whole.stated.names
+    for now, was in (
+        (whole.model, considered(covariance.model, how)),
+        (whole.stated, considered(covariance.stated, how)),
+        (whole.robust, considered(covariance.robust, how)),
+    ):
+        sigma = np.maximum(sigmas(was.matrix), 1e-9)
+        assert now.names == was.names
+        assert np.abs((now.matrix - was.matrix) / np.outer(sigma, sigma)).max() < 1e-8
+    if free == "all":
+        assert whole.inflation == pytest.approx(covariance.inflation, rel=1e-6)
 
 
 def nees(covariance: Covariance, error: FloatArray) -> float:
