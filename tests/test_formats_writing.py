@@ -13,7 +13,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic.calibrations import NAMES, apart_px, put, rig_of, rigs, there
+from synthetic.calibrations import NAMES, apart_px, rig_of, rigs, there
 
 from graphs.camera import project
 from graphs.frames import Transform
@@ -242,7 +242,3 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot write"):
         write_folder_atomically(tmp_path / "file" / "x", {"a": b""})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "out"]
-
-
-def test_put_is_what_the_command_writes(tmp_path: Path) -> None:
-    assert put(exported(rig_of("brown"), "ros"), tmp_path / "x.yaml").is_file()
