@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from synthetic.cameras import camera_of
+from synthetic.hand_written import CALISCOPE, KITTI, QUALISYS
 from synthetic.refusals import refused, written
 
 from graphs.camera import project
@@ -223,23 +224,6 @@ def test_kalibr_omni_is_the_unified_model(tmp_path: Path) -> None:
 
 # ---- Caliscope, Qualisys, KITTI ------------------------------------------------------------
 
-CALISCOPE = """[cameras.0]
-cam_id = 0
-size = [1280, 720]
-matrix = [[900.0, 0.0, 640.0], [0.0, 901.0, 360.0], [0.0, 0.0, 1.0]]
-distortions = [-0.3, 0.1, 0.001, 0.002, 0.0]
-translation = [0.0, 0.0, 0.0]
-rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-[cameras.1]
-cam_id = 1
-size = [1280, 720]
-matrix = [[900.0, 0.0, 640.0], [0.0, 901.0, 360.0], [0.0, 0.0, 1.0]]
-distortions = [-0.3, 0.1, 0.001, 0.002]
-fisheye = true
-translation = [0.1, 0.2, 0.3]
-rotation = [0.1, -0.2, 0.3]
-"""
-
 
 def test_caliscope_with_matrix_and_vector(tmp_path: Path) -> None:
     read = read_calibration(written(tmp_path / "camera_array.toml", CALISCOPE))
@@ -251,19 +235,6 @@ def test_caliscope_with_matrix_and_vector(tmp_path: Path) -> None:
     assert read_calibration(written(tmp_path / "b.toml", broken)).cam_from_rig is None
     broken = CALISCOPE.replace("size = [1280, 720]", "size = 3", 1)
     assert "cam_0 is not whole" in refused(written(tmp_path / "c.toml", broken))
-
-
-QUALISYS = """<?xml version='1.0'?>
-<calibration type="regular"><cameras>
-<camera serial="one">
-<fov_video left="0" top="0" right="1087" bottom="1919"/>
-<transform x="1000" y="0" z="2000" r11="0" r12="1" r13="0" r21="0" r22="0" r23="1"
- r31="1" r32="0" r33="0"/>
-<intrinsic focalLengthU="64000" focalLengthV="64640" centerPointU="32000" centerPointV="60800"
- skew="0" radialDistortion1="-0.05" radialDistortion2="0.1" radialDistortion3="0"
- tangentalDistortion1="0.001" tangentalDistortion2="0.002" sensorMaxU="69568" sensorMaxV="122816"/>
-</camera></cameras></calibration>
-"""
 
 
 def test_qualisys_sees_what_lies_before_it(tmp_path: Path) -> None:
@@ -278,9 +249,6 @@ def test_qualisys_sees_what_lies_before_it(tmp_path: Path) -> None:
     assert seen == pytest.approx(np.array([[0, 0, 1], [0.1, 0, 1], [0, -0.1, 1]]), abs=1e-12)
     assert "0.5 px" in read.notes[0]
     assert "not whole" in refused(written(tmp_path / "b", QUALISYS.replace("skew", "askew")))
-
-
-KITTI = "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP1: 700 0 600 -378 0 700 180 0 0 0 1 0\n"
 
 
 @pytest.mark.parametrize("labels", [True, False])

@@ -1,4 +1,4 @@
-"""Calibrations of any origin: files of other programs read into one form."""
+"""Calibrations of any origin: files of other programs, read into one form and written."""
 
 from sfm_calib.formats.detect import read_calibration
 from sfm_calib.formats.reading import NO_SIZE, CameraRig, LengthUnit

@@ -129,11 +129,15 @@ def _held(rig: CameraRig, camera: Camera, form: Format, max_error_px: float) -> 
     best = int(np.argmin([largest for _, largest in errors]))
     (rms, largest), fit = errors[best], fits[best]
     if not largest <= max_error_px:
-        said = f"{rms:.2g} px rms and {largest:.2g} px at worst" if largest < np.inf else "blind"
+        nearest, remedy = "each of its own sees nothing in a part of the image", ""
+        if largest < np.inf:
+            nearest = (
+                f"its {fit.lens} is nearest, {rms:.2g} px rms and {largest:.2g} px off at worst"
+            )
+            remedy = f"allow more than --max-error-px {max_error_px:g}, or "
         raise CalibrationError(
-            f"{form.title} has no {camera.lens} lens, and of its own {fit.lens} is nearest to "
-            f"{camera.name} of {rig.path}: {said}, more than --max-error-px {max_error_px:g}: "
-            "allow more, or choose another format"
+            f"{form.title} has no {camera.lens} lens, and for {camera.name} of {rig.path} "
+            f"{nearest}: {remedy}choose another format"
         )
     return fit, (
         f"{camera.name}: {camera.lens} is refitted as {fit.lens}, off by {rms:.2g} px rms and "

@@ -30,6 +30,7 @@ from sfm_calib.formats.trees import (
     MOST_BYTES,
     MOST_BYTES_OF_OTHERS,
     MOST_DOTS,
+    MOST_TOML,
     check_length,
     json_tree,
     text_of,
@@ -129,7 +130,7 @@ def _text(path: Path, text: str, start: str) -> CameraRig:
 
 def _toml(text: str) -> Mapping[str, Any]:
     """Empty where it is none."""
-    if max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
+    if len(text) > MOST_TOML or max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
         return {}
     try:
         return tomllib.loads(text)

@@ -72,7 +72,9 @@ def load_storage(path: Path, text: str | None = None) -> Storage:
     if start.startswith("<"):
         tree = _of_xml(xml_root(path, start))
     else:  # JSON is YAML too, but for tabs; and OpenCV's JSON of old has numbers like "1."
-        tree = yaml_tree(path, text) or json_tree(path, text)
+        tree = yaml_tree(path, text)
+        if tree is None and start.startswith("{"):
+            tree = json_tree(path, text)
     if not isinstance(tree, Mapping):
         raise CalibrationError(f"{path} is no OpenCV FileStorage that can be read: no entries")
     matrices: dict[str, FloatArray] = {}

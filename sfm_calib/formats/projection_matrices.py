@@ -11,7 +11,7 @@ import numpy as np
 
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, CameraRig, opencv_camera
+from sfm_calib.formats.reading import MOST_NUMBER, NO_SIZE, CameraRig, opencv_camera
 
 FORMAT = "KITTI projection matrices"
 PLAIN = "camera matrix"
@@ -59,7 +59,8 @@ def read_matrices(path: Path, text: str) -> CameraRig:
         if len(row) != 12:
             continue
         P = np.reshape(row, (3, 4))
-        if abs(P[1, 0]) > 1e-9 or np.abs(P[2, :2]).max() > 1e-9 or not P[0, 0] > 0:
+        off = np.abs(P[[1, 2, 2], [0, 0, 1]]).max()
+        if not (np.abs(P) < MOST_NUMBER).all() or off > 1e-9 or not (P[0, 0] > 0 and P[2, 2] > 0):
             raise CalibrationError(
                 f"{path}: {name} is no projection matrix of a rectified camera, K [I | t]"
             )

@@ -81,5 +81,6 @@ def _cam_from_world(name: str, entry: ElementTree.Element) -> Transform:
     numbers = {key: float(value) for key, value in _part(entry, "transform").items()}
     axes = np.array([[numbers[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)])
     centre_m = M_PER_MM * np.array([numbers[axis] for axis in "xyz"])
-    rotation = transform(name, OPENCV_AXES @ axes, np.zeros(3)).rotation
-    return Transform(rotation, -rotation @ centre_m)
+    axes_and_centre = transform(name, axes, centre_m)
+    rotation = OPENCV_AXES @ axes_and_centre.rotation
+    return Transform(rotation, -rotation @ axes_and_centre.translation)

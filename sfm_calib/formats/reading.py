@@ -73,6 +73,8 @@ class CameraRig:
                     f"{self.path}: {camera.name} has focal lengths {camera.params[0]:.6g} and "
                     f"{camera.params[1]:.6g}: both must be positive"
                 )
+        if any(t.translation.shape != (3,) for t in self.cam_from_rig or ()):
+            raise CalibrationError(f"{self.path}: a camera's place is not whole")
         numbers = [c.params for c in self.cameras] + [
             t.translation for t in self.cam_from_rig or ()
         ]

@@ -68,7 +68,7 @@ def _rectified(
         R = transform(path.name, _matrix(path, content["rectification_matrix"], 3, 3), np.zeros(3))
         if not (P[0, 0] > 0 and P[1, 1] > 0):
             return None
-        shift = Transform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0]))
+        shift = transform(path.name, np.eye(3), [P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0])
         placed.append(R.inverse @ shift)
     apart = np.linalg.norm(placed[0].inverse.translation - placed[1].inverse.translation)
     return tuple(placed) if apart > 0 else None

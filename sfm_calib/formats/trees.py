@@ -19,8 +19,9 @@ from sfm_calib.errors import CalibrationError
 MOST_BYTES = 50_000_000
 # Of all others; OpenCV's longest, with every corner of 500 boards, has 2 MB.
 MOST_BYTES_OF_OTHERS = 5_000_000
-MOST_NODES = 500_000  # of a tree; those 500 boards have 100,000
+MOST_NODES = 200_000  # of a tree, 2 s; those 500 boards have 100,000
 MOST_DEPTH = 40  # lists in lists; calibrations have 6
+MOST_TOML = 1_000_000  # bytes, 2 s; rigs have some 1000
 MOST_DOTS = 1000  # in a line of TOML: its parser takes the square of a key's parts
 _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # texts, lists and mappings alone
 # OpenCV escapes an apostrophe, which neither YAML nor JSON knows.
