@@ -40,6 +40,7 @@ from sfm_calib.commands import (
 from sfm_calib.compare_command import Compare, run_compare
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
+from sfm_calib.convert_command import Convert, run_convert
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.images import camera_names, check_exists
@@ -69,6 +70,7 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[Target, tyro.conf.subcommand("target", default=target_default)]
         | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Convert, tyro.conf.subcommand("convert")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
@@ -133,6 +135,8 @@ def run(command: Command, arguments: Sequence[str]) -> None:
     elif isinstance(command, Compare):
         with output_folder(command.out) if command.out else nullcontext():
             run_compare(command)
+    elif isinstance(command, Convert):
+        run_convert(command)
     elif isinstance(command, Check):
         run_check(command, arguments)
     elif isinstance(command, Simulate):

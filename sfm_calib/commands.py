@@ -11,6 +11,7 @@ import tyro
 from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
+from sfm_calib.convert_command import Convert
 from sfm_calib.simulate.scan import SimulateOptions
 from sfm_calib.simulate.tracks import TrackOptions
 
@@ -140,4 +141,6 @@ class BoardCommand:
     """Replace files that are there."""
 
 
-Command = Calibrate | Target | Compare | BoardCommand | Check | Simulate | SimulateTracks | Demo
+Command = (
+    Calibrate | Target | Compare | Convert | BoardCommand | Check | Simulate | SimulateTracks | Demo
+)

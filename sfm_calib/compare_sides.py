@@ -43,7 +43,7 @@ def side_by_side(
     Raises CalibrationError where cameras cannot be matched, and where image sizes differ.
     """
     pairs, notes = match(a, b, cameras)
-    chosen_a, chosen_b = (_chosen(read, [p[i] for p in pairs]) for i, read in enumerate((a, b)))
+    chosen_a, chosen_b = (read.only([p[i] for p in pairs]) for i, read in enumerate((a, b)))
     names = tuple(p[0] for p in pairs)
     chosen_b = renamed(chosen_b, names)
     chosen_a, chosen_b, of_sizes = _same_sizes(chosen_a, chosen_b)
@@ -137,22 +137,6 @@ def _as_wanted(a: CameraRig, b: CameraRig, wanted: Sequence[str]) -> list[tuple[
         if len({p[place] for p in pairs}) < len(pairs):
             raise CalibrationError(f"--cameras {' '.join(wanted)} names a camera twice")
     return pairs
-
-
-def _chosen(read: CameraRig, names: Sequence[str]) -> CameraRig:
-    """The same with these cameras alone, in this order."""
-    places = [read.names.index(name) for name in names]
-    rig = read.cam_from_rig
-    kept = [i for i, n in enumerate(read.covariance.names) if n.rpartition(".")[0] in names]
-    return replace(
-        read,
-        cameras=tuple(read.cameras[i] for i in places),
-        cam_from_rig=None if rig is None else tuple(rig[i] for i in places),
-        covariance=Covariance(
-            tuple(read.covariance.names[i] for i in kept),
-            read.covariance.matrix[np.ix_(kept, kept)],
-        ),
-    )
 
 
 def renamed(read: CameraRig, names: Sequence[str]) -> CameraRig:

@@ -12,7 +12,7 @@ from typing import Any
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, image_size, opencv_camera, transform
 
 FORMAT = "Caliscope camera_array"
 
@@ -36,10 +36,10 @@ def read_caliscope(path: Path, content: Mapping[str, Any]) -> CameraRig:
     placed: list[Transform | None] = []
     for name, entry in cameras_in(content).items():
         try:
-            width, height = (int(n) for n in entry["size"])
+            width, height = entry["size"]
             camera = opencv_camera(
-                name, (width, height), entry["matrix"], entry.get("distortions", []),
-                bool(entry.get("fisheye", False)),
+                name, image_size(name, width, height), entry["matrix"],
+                entry.get("distortions", []), bool(entry.get("fisheye", False)),
             )  # fmt: skip
             whole = "rotation" in entry and "translation" in entry
             placed.append(

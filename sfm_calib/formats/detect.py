@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
-
-import yaml
 
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.bounded import MOST_BYTES, bounded_bytes
 from sfm_calib.formats.caliscope import cameras_in, read_caliscope
 from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS, read_file_storage
 from sfm_calib.formats.kalibr import read_kalibr
@@ -30,6 +25,16 @@ from sfm_calib.formats.rig_config import (
     read_rig_config,
 )
 from sfm_calib.formats.ros import read_ros, read_ros_pair
+from sfm_calib.formats.trees import (
+    MOST_BYTES,
+    MOST_BYTES_OF_OTHERS,
+    MOST_DOTS,
+    check_length,
+    json_tree,
+    text_of,
+    xml_root,
+    yaml_tree,
+)
 
 KNOWN = (
     "sfm_calib's calibration.json, OpenCV FileStorage (YAML, XML, JSON), ROS camera_info, "
@@ -46,40 +51,58 @@ def read_calibration(path: Path) -> CameraRig:
 
     Raises CalibrationError in one line: what is wrong, or which formats are known.
     """
+    try:
+        return _read(path).checked()
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        # What a reader looked for is there, and is something else.
+        said = " ".join(str(error).split())[:200]
+        raise CalibrationError(f"{path} is no whole calibration: {said}") from error
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _read(path: Path) -> CameraRig:
     if path.is_dir():
         return _folder(path)
     if path.name in COLMAP_FILES:
-        return read_colmap_folder(path.parent)
+        return _colmap(path.parent)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise CalibrationError(_unknown(path))
-        text = path.read_bytes().decode("utf-8")
+        text = text_of(path, MOST_BYTES)
     except UnicodeDecodeError as error:
         raise CalibrationError(_unknown(path)) from error
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
-    return _text(path, text)
+    start = text.lstrip()
+    long = start.startswith("{") or looks_like_mrcal(start)
+    if not long and len(text) > MOST_BYTES_OF_OTHERS:
+        raise CalibrationError(_unknown(path))
+    return _text(path, text, start)
 
 
 def _unknown(path: Path) -> str:
     return f"{path} is no calibration that can be read: known are {KNOWN}"
 
 
+def _colmap(folder: Path) -> CameraRig:
+    for name in (*COLMAP_FILES, "rigs.txt", "rigs.bin"):
+        if (folder / name).exists():
+            check_length(folder / name)
+    return read_colmap_folder(folder)
+
+
 def _folder(folder: Path) -> CameraRig:
     if any((folder / name).is_file() for name in COLMAP_FILES):
-        return read_colmap_folder(folder)
+        return _colmap(folder)
     if (folder / "calibration.json").is_file():
         return read_ours(folder / "calibration.json")
     for name in JSON_FILES:
         if (folder / name).is_file():
             return read_calibration(folder / name)
     if models := sorted(p for p in folder.iterdir() if p.suffix == SUFFIX):
-        return read_mrcal_files({p: bounded_bytes(p).decode("utf-8", "replace") for p in models})
+        return read_mrcal_files({path: text_of(path, MOST_BYTES) for path in models})
     found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
     for path in found:
         if path.stem in (INTRINSICS, EXTRINSICS):
             return read_calibration(path)
-    contents = [_yaml(path.read_text("utf-8", "replace")) for path in found]
+    contents = [_yaml(path, text_of(path)) for path in found]
     if found and all(_is_ros(content) for content in contents):
         return read_ros_pair(tuple(found), tuple(c for c in contents if c is not None))
     raise CalibrationError(
@@ -88,8 +111,7 @@ def _folder(folder: Path) -> CameraRig:
     )
 
 
-def _text(path: Path, text: str) -> CameraRig:
-    start = text.lstrip("\ufeff \t\r\n")
+def _text(path: Path, text: str, start: str) -> CameraRig:
     if start.startswith("<"):
         return _xml(path, start)
     if looks_like_mrcal(start):
@@ -97,16 +119,22 @@ def _text(path: Path, text: str) -> CameraRig:
     if start.startswith("{") or _is_json_list(start):
         return _json(path, start)
     if start.startswith("%YAML") or "!!opencv-matrix" in text:
-        return read_file_storage(path)
+        return read_file_storage(path, text)
     if looks_like_matrices(text):
         return read_matrices(path, text)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        content = {}
-    if cameras_in(content):
+    if cameras_in(content := _toml(text)):
         return read_caliscope(path, content)
-    return _of_yaml(path, _yaml(text))
+    return _of_yaml(path, _yaml(path, text))
+
+
+def _toml(text: str) -> Mapping[str, Any]:
+    """Empty where it is none."""
+    if max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
+        return {}
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError):
+        return {}
 
 
 def _is_json_list(start: str) -> bool:
@@ -115,22 +143,16 @@ def _is_json_list(start: str) -> bool:
 
 
 def _xml(path: Path, text: str) -> CameraRig:
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise CalibrationError(f"{path} is no whole XML: {error}") from error
+    root = xml_root(path, text)
     if root.tag == "opencv_storage":
-        return read_file_storage(path)
+        return read_file_storage(path, text)
     if root.find("cameras/camera/intrinsic") is not None:
         return read_qualisys(path, root)
     raise CalibrationError(_unknown(path))
 
 
 def _json(path: Path, text: str) -> CameraRig:
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path} is no whole JSON: {error}") from error
+    content = json_tree(path, text)
     if looks_like_rig_config(content):
         return read_rig_config(path, content)
     if looks_like_nerf(content):
@@ -139,15 +161,12 @@ def _json(path: Path, text: str) -> CameraRig:
         raise CalibrationError(_unknown(path))
     if "cameras" in content or str(content.get("format", "")).startswith("sfm_calib"):
         return read_ours(path)
-    return read_file_storage(path)
+    return read_file_storage(path, text)
 
 
-def _yaml(text: str) -> Mapping[str, Any] | None:
+def _yaml(path: Path, text: str) -> Mapping[str, Any] | None:
     """None where it is no YAML mapping."""
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError:
-        return None
+    content = yaml_tree(path, text)
     return content if isinstance(content, Mapping) else None
 
 

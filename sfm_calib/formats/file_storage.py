@@ -1,21 +1,31 @@
 """OpenCV's FileStorage, in YAML, XML or JSON: one camera, or the two of its stereo sample.
 
 R and T of a stereo file take points of the first camera to the second. The unit of T is that of
-the board's squares, which the file does not say.
+the board's squares, which the file does not say, unless we wrote it. More cameras are as OpenCV's
+multi-camera sample has them (samples/python/multiview_calibration.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 
 from graphs.frames import FloatArray, Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, CameraRig, opencv_camera, transform
+from sfm_calib.formats.reading import (
+    NO_SIZE,
+    OPENCV_LENSES,
+    CameraRig,
+    LengthUnit,
+    image_size,
+    opencv_camera,
+    transform,
+)
+from sfm_calib.formats.trees import json_tree, text_of, xml_root, yaml_tree
 
 FORMAT = "OpenCV FileStorage"
 MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
@@ -28,6 +38,8 @@ DISTORTION_OF = ("D{}", "distCoeffs{}", "dist_coeffs{}", "distortion{}", "dist_c
 WIDTH, HEIGHT = ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height")
 SIZE = ("image_size", "imageSize", "size")
 ROTATION, TRANSLATION = ("R", "rotation"), ("T", "t", "translation")
+# Ours: what OpenCV's own files do not tell.
+NAME_OF, UNIT = "camera_name{}", "length_unit"
 FISHEYE = ("fisheye_model", "fisheye", "useFisheye")
 INTRINSICS, EXTRINSICS = "intrinsics", "extrinsics"  # names of the stereo sample's two files
 
@@ -49,51 +61,67 @@ class Storage:
         return None if found is None or found.size != 1 else float(found.flat[0])
 
 
-def load_storage(path: Path) -> Storage:
-    """Raises CalibrationError where OpenCV cannot read the file."""
-    try:
-        storage = cv2.FileStorage(
-            path.read_text("utf-8", "replace"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-        )
-        root = storage.root()
-        keys = list(root.keys()) if root.isMap() else []
-    except (cv2.error, SystemError) as error:
-        said = str(error).strip().splitlines()[-1]
-        raise CalibrationError(
-            f"{path} is no OpenCV FileStorage that can be read: {said}"
-        ) from error
+def load_storage(path: Path, text: str | None = None) -> Storage:
+    """Its entries that are numbers or texts, without OpenCV, whose parser trusts what it reads.
+
+    Raises CalibrationError where it is no whole FileStorage.
+    """
+    text = text_of(path) if text is None else text
+    start = text.lstrip()
+    tree: object
+    if start.startswith("<"):
+        tree = _of_xml(xml_root(path, start))
+    else:  # JSON is YAML too, but for tabs; and OpenCV's JSON of old has numbers like "1."
+        tree = yaml_tree(path, text) or json_tree(path, text)
+    if not isinstance(tree, Mapping):
+        raise CalibrationError(f"{path} is no OpenCV FileStorage that can be read: no entries")
     matrices: dict[str, FloatArray] = {}
     texts: dict[str, str] = {}
-    for key in keys:
-        node = storage.getNode(key)
-        if node.isInt() or node.isReal():
-            matrices[key] = np.array([float(node.real())])
-        elif node.isString():
-            texts[key] = node.string()
-        elif node.isSeq():
-            numbers = [node.at(i) for i in range(node.size())]
-            if all(n.isInt() or n.isReal() for n in numbers):
-                matrices[key] = np.array([float(n.real()) for n in numbers])
-        else:
-            found = node.mat()
-            if found is not None:
-                matrices[key] = np.asarray(found, dtype=np.float64)
-    storage.release()
+    for key, entry in tree.items():
+        numbers = entry.get("data") if isinstance(entry, Mapping) else entry
+        if isinstance(numbers, str):
+            texts[str(key)] = numbers
+            numbers = numbers.split()
+        try:
+            found = np.array(numbers, dtype=np.float64)
+        except (TypeError, ValueError):
+            continue
+        matrices[str(key)] = found.reshape(_shape(entry, found.size))
     return Storage(path, matrices, texts)
 
 
-def read_file_storage(path: Path) -> CameraRig:
+def _shape(entry: object, size: int) -> tuple[int, ...]:
+    """Rows and columns where a matrix states them and has so many numbers; else a flat one."""
+    if isinstance(entry, Mapping):
+        rows, columns = str(entry.get("rows", "")), str(entry.get("cols", ""))
+        if rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) == size:
+            return int(rows), int(columns)
+    return (size,)
+
+
+def _of_xml(element: ElementTree.Element) -> object:
+    children = list(element)
+    if not children:
+        return (element.text or "").strip().removeprefix('"').removesuffix('"')
+    if all(child.tag == "_" for child in children):
+        return [_of_xml(child) for child in children]
+    return {child.tag: _of_xml(child) for child in children}
+
+
+def read_file_storage(path: Path, text: str | None = None) -> CameraRig:
     """One camera, or two with R and T; of the stereo sample's two files, either or their folder.
 
     Raises CalibrationError where there is no camera matrix.
     """
-    storage = load_storage(path)
+    storage = load_storage(path, text)
     if storage.matrix([name.format(1) for name in MATRIX_OF]) is None and (
         EXTRINSICS in path.stem and (beside := _other(path, EXTRINSICS, INTRINSICS))
     ):
         storage = load_storage(beside)
     if (first := storage.matrix([name.format(1) for name in MATRIX_OF])) is not None:
         return _stereo(storage, first)
+    if "Ks" in storage.matrices:
+        return _several(storage)
     matrix = storage.matrix(MATRIX)
     if matrix is None:
         raise CalibrationError(
@@ -102,7 +130,7 @@ def read_file_storage(path: Path) -> CameraRig:
     distortion = storage.matrix(DISTORTION)
     model = storage.texts.get("distortion_model", storage.texts.get("camera_model", "")).lower()
     fisheye = bool(storage.number(FISHEYE)) or model in ("fisheye", "equidistant", "kannala_brandt")
-    name = storage.texts.get("camera_name", path.stem)
+    name = storage.texts.get("camera_name") or path.stem
     camera = opencv_camera(
         name, _size(storage), matrix, np.zeros(0) if distortion is None else distortion, fisheye
     )
@@ -120,7 +148,9 @@ def _size(storage: Storage) -> tuple[int, int]:
     both = storage.matrix(SIZE)
     if both is not None and both.size == 2:
         width, height = float(both.flat[0]), float(both.flat[1])
-    return (int(width), int(height)) if width and height else NO_SIZE
+    if not width or not height:
+        return NO_SIZE
+    return image_size(f"{storage.path}", width, height)
 
 
 def _stereo(storage: Storage, first: FloatArray) -> CameraRig:
@@ -132,8 +162,9 @@ def _stereo(storage: Storage, first: FloatArray) -> CameraRig:
     for number, matrix in ((1, first), (2, second)):
         k = storage.matrix([name.format(number) for name in DISTORTION_OF])
         distortion = np.zeros(0) if k is None else k
-        cameras.append(opencv_camera(f"cam{number}", _size(storage), matrix, distortion, fisheye))
-    place, notes = storage, (f"{storage.path}: T is counted in units that it does not state",)
+        name = storage.texts.get(NAME_OF.format(number)) or f"cam{number}"
+        cameras.append(opencv_camera(name, _size(storage), matrix, distortion, fisheye))
+    place = storage
     if storage.matrix(ROTATION) is None and (
         beside := _other(storage.path, INTRINSICS, EXTRINSICS)
     ):
@@ -144,4 +175,50 @@ def _stereo(storage: Storage, first: FloatArray) -> CameraRig:
         return CameraRig(storage.path, FORMAT, tuple(cameras), None, notes=notes)
     second_from_first = transform("R, T", R, T)
     rig = (Transform.identity(), second_from_first)
-    return CameraRig(storage.path, FORMAT, tuple(cameras), rig, notes=notes)
+    unit, of_unit = _unit(storage, "T is")
+    return CameraRig(storage.path, FORMAT, tuple(cameras), rig, unit, notes=of_unit)
+
+
+def _unit(storage: Storage, what: str) -> tuple[LengthUnit, tuple[str, ...]]:
+    stated = storage.texts.get(UNIT, "")
+    if stated == "m":
+        return "m", ()
+    if stated == "baseline":
+        return "baseline", ()
+    return "unknown", (f"{storage.path}: {what} counted in units that it does not state",)
+
+
+def _several(storage: Storage) -> CameraRig:
+    """As OpenCV's multi-camera sample writes them: all cameras' matrices in one, rvecs and Ts."""
+    try:
+        Ks = storage.matrices["Ks"].reshape(-1, 3, 3)
+        n = len(Ks)
+        k = storage.matrices["distortions"].reshape(n, -1)
+        sizes = storage.matrices["image_sizes"].reshape(n, 2)
+        turns = storage.matrices["rvecs"].reshape(n, 3)
+        moves = storage.matrices["Ts"].reshape(n, 3)
+        fisheye = storage.matrices.get("is_fisheye", np.zeros(n)).ravel()
+        ids = storage.texts.get("cam_ids", "").split(",")
+        ids = ids if len(ids) == n else [str(i) for i in range(n)]
+        names = [storage.texts.get(NAME_OF.format(i + 1)) or ids[i] for i in range(n)]
+        cameras = tuple(
+            opencv_camera(
+                names[i], image_size(names[i], *sizes[i]), Ks[i],
+                _shortest(k[i]) if not fisheye[i] else k[i, :4], bool(fisheye[i]),
+            )
+            for i in range(n)
+        )  # fmt: skip
+        rig = tuple(transform(names[i], turns[i], moves[i]) for i in range(n))
+    except (KeyError, IndexError, ValueError) as error:
+        raise CalibrationError(
+            f"{storage.path}: its cameras are not whole (Ks, distortions, image_sizes, rvecs and "
+            f"Ts must tell of as many): {error}"
+        ) from error
+    unit, notes = _unit(storage, "Ts are")
+    return CameraRig(storage.path, FORMAT, cameras, rig, unit, notes=notes)
+
+
+def _shortest(k: FloatArray) -> FloatArray:
+    """Distortion coefficients (k,) without zeros that only fill a matrix of several cameras."""
+    used = int(np.flatnonzero(k)[-1]) + 1 if k.any() else 4
+    return k[: next((n for n in OPENCV_LENSES if n >= max(used, 4)), k.size)]

@@ -14,10 +14,12 @@ import numpy as np
 from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, image_size, opencv_camera, transform
 
 FORMAT = "Kalibr camchain"
 PINHOLE_DISTORTION = {"radtan": False, "equidistant": True, "equi": True, "none": False}
+
+OWN = {"eucm": 2, "ds": 2, "omni": 1}  # intrinsics before the focal lengths
 
 
 def read_kalibr(path: Path, content: Mapping[str, Any]) -> CameraRig:
@@ -28,19 +30,25 @@ def read_kalibr(path: Path, content: Mapping[str, Any]) -> CameraRig:
     try:
         cameras = tuple(_camera(path, name, entry) for name, entry in entries.items())
         rig = _chain(path, entries)
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path} is no whole Kalibr camchain: {error!r}") from error
     notes = () if rig or len(cameras) == 1 else (f"{path} has no T_cn_cnm1: no rig",)
     return CameraRig(path, FORMAT, cameras, rig, "m", notes=notes)
 
 
 def _camera(path: Path, name: str, entry: Mapping[str, Any]) -> Camera:
-    size = (int(entry["resolution"][0]), int(entry["resolution"][1]))
+    name = str(entry.get("camera_name") or name)
+    width, height = entry["resolution"]
+    size = image_size(name, width, height)
     model = str(entry["camera_model"])
     distortion = str(entry.get("distortion_model", "none")).lower()
     k = np.array(entry.get("distortion_coeffs") or [], dtype=np.float64)
     numbers = np.array(entry["intrinsics"], dtype=np.float64)
     own, focal = numbers[:-4], numbers[-4:]
+    if numbers.size != 4 + OWN.get(model, 0):
+        raise CalibrationError(
+            f"{path}: {name} is {model} with {numbers.size} intrinsics, not {4 + OWN.get(model, 0)}"
+        )
     if model == "pinhole" and distortion in PINHOLE_DISTORTION:
         matrix = np.array([[focal[0], 0, focal[2]], [0, focal[1], focal[3]], [0, 0, 1]])
         k = k if distortion != "none" else np.zeros(0)

@@ -18,7 +18,7 @@ import numpy as np
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
+from sfm_calib.formats.reading import CameraRig, image_size, opencv_camera, transform
 
 FORMAT = "Qualisys qca"
 SUBPIXELS = 64.0
@@ -73,7 +73,8 @@ def _camera(name: str, entry: ElementTree.Element) -> Camera:
             ("radial", 1), ("radial", 2), ("tangental", 1), ("tangental", 2), ("radial", 3),
         )
     ]  # fmt: skip
-    return opencv_camera(name, (round(right - left + 1), round(bottom - top + 1)), matrix, k)
+    size = image_size(name, round(right - left + 1), round(bottom - top + 1))
+    return opencv_camera(name, size, matrix, k)
 
 
 def _cam_from_world(name: str, entry: ElementTree.Element) -> Transform:

@@ -13,13 +13,21 @@ from graphs.camera import Camera
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
-from sfm_calib.errors import CalibrationError
+from graphs.pose_covariance import rereferenced
+from graphs.problem import Estimate
+from graphs.propagation import pose_names
+from sfm_calib import result
+from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.result import Calibration, CameraResult, CamFromRig, RigResult, Scale
 
 # m; the longest baseline, 1 long; or whatever the file's author counted in, and did not say.
 LengthUnit = Literal["m", "baseline", "unknown"]
 NO_SIZE: Final = (0, 0)  # of an image whose size the file does not state
 NOTHING: Final = Covariance((), np.zeros((0, 0)))
+MOST_SIZE = 100_000  # px across: five times the largest sensor there is
+MOST_NUMBER = 1e9  # beyond, it is no focal length, coefficient or distance
+MOST_NAME = 200  # characters of a camera's name: file systems end at 255
+MOST_CAMERAS = 1000
 MOST_SKEW_PX = 1e-6  # of a camera matrix: rounding
 MOST_UNROTATION = 1e-3  # of R R' off the identity: typed with three digits
 OPENCV_LENSES: dict[int, LensName] = {
@@ -47,8 +55,79 @@ class CameraRig:
     def states_sigmas(self) -> bool:
         return bool(np.diag(self.covariance.matrix).any())
 
+    def checked(self) -> CameraRig:
+        """Itself. Raises CalibrationError for names, sizes and numbers that no camera has."""
+        names = self.names
+        if not 0 < len(names) <= MOST_CAMERAS:
+            raise CalibrationError(f"{self.path} holds {len(names)} cameras: it is no calibration")
+        for name in names:
+            if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
+                raise CalibrationError(f"{self.path}: {name[:40]!r} is no name for a camera")
+            if names.count(name) > 1:
+                raise CalibrationError(f"{self.path} calls two cameras {name}: name them apart")
+        for camera in self.cameras:
+            if camera.size != NO_SIZE and not 0 < min(camera.size) <= max(camera.size) <= MOST_SIZE:
+                raise _no_size(camera.name, *camera.size)
+            if not camera.params[:2].min() > 0:
+                raise CalibrationError(
+                    f"{self.path}: {camera.name} has focal lengths {camera.params[0]:.6g} and "
+                    f"{camera.params[1]:.6g}: both must be positive"
+                )
+        numbers = [c.params for c in self.cameras] + [
+            t.translation for t in self.cam_from_rig or ()
+        ]
+        if not (np.abs(np.concatenate(numbers)) < MOST_NUMBER).all():
+            raise CalibrationError(
+                f"{self.path} holds a number beyond {MOST_NUMBER:.0g}, or none at all: it is no "
+                "calibration"
+            )
+        return self
+
+    def only(self, names: Sequence[str]) -> CameraRig:
+        """The same with these cameras alone, in this order.
+
+        Raises CalibrationError for a camera that is not there, or twice.
+        """
+        for name in names:
+            if name not in self.names:
+                raise CalibrationError(
+                    f"{self.path} has no camera {name!r}: {nearest(name, self.names)}"
+                )
+        if len(set(names)) < len(names):
+            raise CalibrationError(f"{' '.join(names)} names a camera twice")
+        places = [self.names.index(name) for name in names]
+        rig = self.cam_from_rig
+        kept = [i for i, n in enumerate(self.covariance.names) if n.rpartition(".")[0] in names]
+        return replace(
+            self,
+            cameras=tuple(self.cameras[i] for i in places),
+            cam_from_rig=None if rig is None else tuple(rig[i] for i in places),
+            covariance=Covariance(
+                tuple(self.covariance.names[i] for i in kept),
+                self.covariance.matrix[np.ix_(kept, kept)],
+            ),
+        )
+
+    def referenced(self) -> tuple[CameraRig, int]:
+        """The rig in the frame of one of its cameras, the first that is there or else the first.
+
+        With its covariance; and which camera that is. `cam_from_rig` must be known.
+        """
+        assert self.cam_from_rig is not None
+        rig = self.cam_from_rig
+        at_origin = [
+            i
+            for i, t in enumerate(rig)
+            if not t.translation.any() and np.array_equal(t.rotation, np.eye(3))
+        ]
+        if at_origin:
+            return self, at_origin[0]
+        estimate = Estimate(self.cameras, rig, (), np.zeros((0, 3)))
+        new, covariance = rereferenced(estimate, self.covariance, 0)
+        return replace(self, cam_from_rig=new.cam_from_rig, covariance=covariance), 0
+
     def calibration(self) -> Calibration:
-        """As a result, the first camera its reference.
+        """As a result, with the sigmas that it states; reference as `referenced`.
 
         Raises CalibrationError where the file does not say how its cameras sit, or how large
         their images are.
@@ -63,25 +142,35 @@ class CameraRig:
                 raise CalibrationError(
                     f"{self.path} does not state the image size of {camera.name}: add it"
                 )
-        rig_from_first = self.cam_from_rig[0].inverse
-        placed = [t @ rig_from_first for t in self.cam_from_rig]
+        rig, reference = self.referenced()
         return Calibration(
-            cameras={
-                c.name: CameraResult(lens=c.lens, size=c.size, params=c.named())
-                for c in self.cameras
-            },
+            cameras={c.name: rig._camera_result(c) for c in rig.cameras},
             rig=RigResult(
-                reference=self.cameras[0].name,
-                cam_from_rig={
-                    c.name: CamFromRig(
-                        rotation_wxyz=tuple(t.rotation_wxyz.tolist()),
-                        translation=tuple(t.translation.tolist()),
-                    )
-                    for c, t in zip(self.cameras, placed, strict=True)
-                },
+                reference=rig.names[reference],
+                cam_from_rig={name: rig._place(i) for i, name in enumerate(rig.names)},
                 metric=self.unit == "m",
                 scale=Scale(source=self.format),
             ),
+            covariance=result.Covariance(
+                names=rig.covariance.names,
+                matrix=tuple(tuple(row) for row in rig.covariance.matrix.tolist()),
+            ),
+        )
+
+    def _camera_result(self, camera: Camera) -> CameraResult:
+        sigma = self.covariance.sigma if self.covariance.names else {}
+        told = {n: sigma.get(f"{camera.name}.{n}", 0.0) for n in camera.names} if sigma else {}
+        return CameraResult(lens=camera.lens, size=camera.size, params=camera.named(), sigma=told)
+
+    def _place(self, index: int) -> CamFromRig:
+        assert self.cam_from_rig is not None
+        place, sigma = self.cam_from_rig[index], self.covariance.sigma
+        x, y, z, *moved = (sigma.get(name, 0.0) for name in pose_names(self.names[index]))
+        return CamFromRig(
+            rotation_wxyz=tuple(place.rotation_wxyz.tolist()),
+            translation=tuple(place.translation.tolist()),
+            sigma_rotation_deg=tuple(np.degrees([x, y, z]).tolist()),
+            sigma_translation=(moved[0], moved[1], moved[2]),
         )
 
     def metric(self, metres: float) -> CameraRig:
@@ -98,6 +187,24 @@ class CameraRig:
         )
 
 
+def image_size(name: str, width: object, height: object) -> tuple[int, int]:
+    """Of numbers or their texts; NO_SIZE of two zeros. Raises CalibrationError for no such size."""
+    try:
+        pair = float(str(width)), float(str(height))
+        if pair == NO_SIZE or all(0 < n <= MOST_SIZE and n == int(n) for n in pair):
+            return int(pair[0]), int(pair[1])
+    except (ValueError, OverflowError):
+        pass
+    raise _no_size(name, width, height)
+
+
+def _no_size(name: str, width: object, height: object) -> CalibrationError:
+    return CalibrationError(
+        f"{name}: its images are {str(width)[:20]} x {str(height)[:20]} px: each must be a whole "
+        f"number from 1 to {MOST_SIZE}"
+    )
+
+
 def opencv_camera(
     name: str,
     size: tuple[int, int],
@@ -112,8 +219,11 @@ def opencv_camera(
     """
     K = np.asarray(matrix, dtype=np.float64)
     k = np.asarray(distortion, dtype=np.float64).ravel()
-    if K.shape != (3, 3) or not np.isfinite(K).all() or not np.isfinite(k).all():
-        raise CalibrationError(f"{name}: its camera matrix is no 3 x 3 matrix of numbers")
+    if K.shape != (3, 3) or not _are_sane(K, k):
+        raise CalibrationError(
+            f"{name}: its camera matrix must be 3 x 3, and it and its distortion be numbers below "
+            f"{MOST_NUMBER:.0g}"
+        )
     if abs(K[0, 1]) > MOST_SKEW_PX:
         raise CalibrationError(
             f"{name}: its camera matrix has a skew of {K[0, 1]:.6g} px, which no lens here has: "
@@ -146,10 +256,13 @@ def transform(name: str, rotation: object, translation: object) -> Transform:
     """
     R = np.asarray(rotation, dtype=np.float64)
     t = np.asarray(translation, dtype=np.float64).ravel()
-    if R.size == 3 and t.size == 3 and np.isfinite([*R.ravel(), *t]).all():
+    if R.size == 3 and t.size == 3 and _are_sane(R, t):
         return Transform.exp(R.ravel(), t)
-    if R.shape != (3, 3) or t.size != 3 or not np.isfinite([*R.ravel(), *t]).all():
-        raise CalibrationError(f"{name}: its rotation must be a 3 x 3 matrix, its translation 3")
+    if R.shape != (3, 3) or t.size != 3 or not _are_sane(R, t):
+        raise CalibrationError(
+            f"{name}: its rotation must be a 3 x 3 matrix and its translation 3, of numbers below "
+            f"{MOST_NUMBER:.0g}"
+        )
     off = float(np.abs(R @ R.T - np.eye(3)).max())
     if off > MOST_UNROTATION or np.linalg.det(R) < 0:
         raise CalibrationError(
@@ -158,3 +271,8 @@ def transform(name: str, rotation: object, translation: object) -> Transform:
         )
     u, _, vt = np.linalg.svd(R)  # the nearest rotation: files round
     return Transform(u @ vt, t)
+
+
+def _are_sane(*arrays: FloatArray) -> bool:
+    """Whether all are finite, and of a size whose squares are."""
+    return all(bool((np.abs(a) < MOST_NUMBER).all()) for a in arrays)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.formats.reading import CameraRig
 
@@ -32,3 +34,37 @@ class Format:
     cameras: Literal["one", "two", "any"]  # in one file or folder, with how they sit
     name: str  # of the file, or "" where OUT is a folder
     write: Callable[[CameraRig], Export]
+    metres: bool = False  # its lengths are in metres by definition: another unit would be wrong
+    # More cameras than `cameras` go into a file each, without how they sit: then it may be None.
+    apart: bool = False
+
+
+def of_camera(rig: CameraRig, reference: int = 0) -> tuple[tuple[Transform, ...], tuple[str, ...]]:
+    """How each camera sits from one of them, and a note where the file had a frame of its own."""
+    assert rig.cam_from_rig is not None
+    rig_from_reference = rig.cam_from_rig[reference].inverse
+    places = [place @ rig_from_reference for place in rig.cam_from_rig]
+    places[reference] = Transform.identity()  # exactly
+    if rig.referenced()[0] is rig:
+        return tuple(places), ()
+    return tuple(places), (
+        f"the file's own frame is not held: places are counted from {rig.names[reference]}",
+    )
+
+
+def of_sigmas(rig: CameraRig) -> tuple[str, ...]:
+    """The note of a format without sigmas, where there are any."""
+    return ("sigmas and covariance are not held",) if rig.states_sigmas else ()
+
+
+def file_names(names: tuple[str, ...], suffix: str) -> tuple[str, ...]:
+    """A file for each camera: its name without what a path or a shell reads into it."""
+    stems: list[str] = []
+    for name in names:
+        stem = plain = re.sub(r"[^\w.+-]", "_", name).lstrip(".-") or "camera"
+        number = 1
+        while stem.lower() in (s.lower() for s in stems):
+            number += 1
+            stem = f"{plain}_{number}"
+        stems.append(stem)
+    return tuple(f"{stem}{suffix}" for stem in stems)
