@@ -98,7 +98,7 @@ def _folder(folder: Path) -> CameraRig:
         if (folder / name).is_file():
             return read_calibration(folder / name)
     if models := sorted(p for p in folder.iterdir() if p.suffix == SUFFIX):
-        return read_mrcal_files({p: bounded_bytes(p).decode("utf-8", "replace") for p in models})
+        return read_mrcal_files({path: text_of(path, MOST_BYTES) for path in models})
     found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
     for path in found:
         if path.stem in (INTRINSICS, EXTRINSICS):
