@@ -114,7 +114,8 @@ def recalibrate(
 ) -> Recalibrated:
     """Test an old calibration by a scan, and calibrate its rig anew.
 
-    drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the two have no camera in common.
+    drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the
+    two have no camera in common.
     """
     watch = Stopwatch()
     if options.metres is not None:
