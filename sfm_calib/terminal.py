@@ -23,11 +23,11 @@ from rich.table import Table
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.images import Progress as Report
-from sfm_calib.report import TruthRow
 from sfm_calib.report.board import board_lines, gains
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.digits import sigma_text, with_digits
 from sfm_calib.report.lens_ladder import rung_label
+from sfm_calib.report.rows import TruthRow
 from sfm_calib.report.weak import Mark, marks_of
 from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration
 
