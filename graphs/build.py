@@ -12,6 +12,7 @@ from graphs.boards import insert_board, shape_prior_factor
 from graphs.clusters import Tracks, make_tracks
 from graphs.frames import NOT_SMART, FloatArray, to_gtsam_inverse
 from graphs.gauge import add_gauge
+from graphs.joint_prior import joint_prior_factor
 from graphs.keys import frame_key, lens_key, rig_key
 from graphs.losses import SCALE_95, LossName
 from graphs.priors import LensPrior, RigPrior, weak_lens_prior
@@ -82,6 +83,9 @@ def build(
         others.add(shape_prior_factor(problem.board.board))
     for source in problem.scales:
         others.add(scale_factor(problem, source, noise, lens_of, options.loss, options.loss_scale))
+    earlier = joint_prior_factor(problem, lens_of)
+    if earlier is not None:
+        others.add(earlier)
     initial = initial_values(problem, lens_of)
     if extra is not None:
         _check_soft(extra)

@@ -43,6 +43,12 @@ def choose_gauge(problem: Problem) -> Gauge | None:
     from_frame = np.linalg.norm(centres - centres[frame], axis=1) * of_scene
     cameras = [t.inverse.translation for t in problem.initial.cam_from_rig]
     baselines = np.linalg.norm(np.array(cameras) - cameras[problem.reference], axis=1)
+    # Places held in a rig's own unit are stiff: 5 steps with that unit held, 35 with another.
+    prior, names = problem.prior, [camera.name for camera in problem.initial.cameras]
+    if prior is not None and f"{prior.unit}.translation_x" in prior.held:
+        unit = names.index(prior.unit or "")
+        if baselines[unit] > 0:
+            return Gauge(frame, float(baselines[unit]), cameras=(problem.reference, unit))
     path, baseline = float(from_frame.max()), float(baselines.max())
     if max(path, baseline) <= 0:
         raise ValueError("all images were taken from one point: turn and move the camera")

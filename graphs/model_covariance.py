@@ -20,7 +20,7 @@ from graphs.frames import FloatArray, reported_from_tangent
 from graphs.influence import responses
 from graphs.keys import lens_key, rig_key
 from graphs.noise import LossMoments, loss_moments
-from graphs.problem import Estimate, IntArray, residuals_px
+from graphs.problem import Estimate, IntArray, Problem, residuals_px
 from graphs.solve import threads
 from graphs.system import assemble, jacobian_of
 from graphs.unit import baseline_unit, unit_jacobian
@@ -73,22 +73,14 @@ def model_covariance(
         nothing, response = np.zeros((0, 0)), np.zeros((graph.layout.elimination.n_columns, 0))
         return ModelCovariance(names, nothing, np.zeros((0, 0)), response, moments, None, 1.0)
     others = graph.others.linearize(values)
-    with threads() as pool:
-        system = assemble(
-            graph.tracks,
-            others,
-            graph.layout,
-            graph.variables(values),
-            homogeneous(graph.tracks, estimate.points),
-            pool,
-            moments.curvature,
-        )
-        response = responses(graph, system, columns)
+    response = response_at(graph, estimate, values, others, columns, moments.curvature)
     by_tangent, unit = to_reported, 1.0
     unit_camera = None if like is None else like.unit_camera
     if not graph.problem.metric and like is None:
         whole = Covariance(names, to_reported @ response[columns] @ to_reported.T)
-        unit_camera = baseline_unit(estimate, graph.problem.reference, whole)
+        unit_camera = _unit_of_prior(graph.problem)
+        if unit_camera is None:
+            unit_camera = baseline_unit(estimate, graph.problem.reference, whole)
     if unit_camera is not None:
         unit = float(np.linalg.norm(estimate.cam_from_rig[unit_camera].translation))
         by_tangent = unit_jacobian(names, estimate, unit_camera) @ to_reported
@@ -101,18 +93,54 @@ def model_covariance(
     )  # fmt: skip
 
 
+def response_at(
+    graph: CalibrationGraph,
+    estimate: Estimate,
+    values: gtsam.Values,
+    others: gtsam.GaussianFactorGraph,
+    columns: IntArray,
+    curvature: float,
+) -> FloatArray:
+    """Columns of the inverse normal equations (n_columns, len(columns)) at the optimum.
+
+    others: the graph's other factors, linearised there; curvature: of the loss, in its weights'.
+    Raises ValueError when the problem determines less than it asks for.
+    """
+    with threads() as pool:
+        system = assemble(
+            graph.tracks,
+            others,
+            graph.layout,
+            graph.variables(values),
+            homogeneous(graph.tracks, estimate.points),
+            pool,
+            curvature,
+        )
+        return responses(graph, system, columns)
+
+
+def _unit_of_prior(problem: Problem) -> int | None:
+    """The camera whose baseline is an earlier calibration's unit: its lengths stay comparable."""
+    if problem.prior is None or problem.prior.unit is None:
+        return None
+    return [camera.name for camera in problem.initial.cameras].index(problem.prior.unit)
+
+
 def calibration_columns(
-    graph: CalibrationGraph, estimate: Estimate
+    graph: CalibrationGraph, estimate: Estimate, held: bool = False
 ) -> tuple[IntArray, tuple[str, ...], FloatArray]:
     """Columns of the free lens parameters and cam_from_rig, their names, and the Jacobian
-    from GTSAM's tangent to the reported parameters."""
+    from GTSAM's tangent to the reported parameters.
+
+    held: of lens parameters that are held too.
+    """
     layout = graph.layout
     columns: list[int] = []
     names: list[str] = []
     blocks: list[FloatArray] = []
     for index, camera in enumerate(estimate.cameras):
         lens = layout.lens_of[index]
-        free = np.flatnonzero(graph.lens_priors[lens].free)
+        free = np.flatnonzero(graph.lens_priors[lens].free | held)
         columns += layout.columns(lens_key(lens))[free].tolist()
         names += [f"{camera.name}.{camera.names[i]}" for i in free]
         blocks.append(np.eye(len(free)))

@@ -11,10 +11,12 @@ from scipy.optimize import minimize_scalar
 
 from graphs.boards import N_WHOLE
 from graphs.build import GraphOptions
+from graphs.covariance import POSE_NAMES
 from graphs.frames import FloatArray
 from graphs.losses import weight_and_slope
 from graphs.problem import IntArray, KnownSpan, Problem, points_in_cameras
 
+PLACES = tuple(f".{name}" for name in POSE_NAMES)
 # Median of the norm of a 2-D Gaussian of unit sigma (Rayleigh): sqrt(2 ln 2).
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
 # Perfect data has no noise; weights need a scale above rounding.
@@ -42,7 +44,8 @@ def free_dimensions(problem: Problem, options: GraphOptions | None = None) -> in
     gauge = 6 if problem.metric else 7
     if problem.of_board_alone:
         gauge = 0
-    rig = 6 * (len(start.cameras) - 1)
+    held = () if problem.prior is None else problem.prior.held
+    rig = 6 * (len(start.cameras) - 1) - sum(name.endswith(PLACES) for name in held)
     lenses = _free_lens_parameters(problem, options)
     return lenses + rig + 6 * frames + 3 * points + round(_of_corners(problem).sum()) - gauge
 

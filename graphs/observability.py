@@ -18,6 +18,7 @@ from graphs.build import CalibrationGraph
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, reported_from_tangent
 from graphs.image_grid import ImageGrid, centre, corners, image_grid, typical_distances
+from graphs.joint_prior import parameters, prior_rows
 from graphs.motion import Views, of_board_in_words, shared_lacks, views_of
 from graphs.motion import in_words as motion_in_words
 from graphs.problem import Estimate, IntArray
@@ -137,7 +138,7 @@ def weak_directions(
 def prior_information(
     graph: CalibrationGraph, estimate: Estimate, names: Sequence[str], unit: float = 1.0
 ) -> FloatArray:
-    """What the priors on lenses and rig say of the reported parameters `names` (n, n).
+    """What priors and an earlier calibration say of the reported parameters `names` (n, n).
 
     estimate: the graph's optimum. unit: of the reported lengths, in the estimate's. A lens that
     cameras share counts once, with the first of them. Measured lengths are data.
@@ -159,6 +160,12 @@ def prior_information(
         from_reported[:, 3:] *= unit
         of_tangent = np.diag(sigmas**-2.0)
         add(pose_names(estimate.cameras[index].name), from_reported.T @ of_tangent @ from_reported)
+    earlier = graph.problem.prior
+    if earlier is not None:
+        of = parameters(earlier)
+        by_reported = prior_rows(earlier, estimate)
+        by_reported = by_reported * [unit if ".translation_" in name else 1.0 for name in of]
+        add(of, by_reported.T @ by_reported)
     return information
 
 

@@ -37,7 +37,7 @@ PINNED_SIGMA = 1e-9  # a parameter that is held fixed
 
 @dataclass(frozen=True)
 class LensPrior:
-    """Independent beliefs in each lens parameter, and one in the aspect ratio fy / fx."""
+    """Independent beliefs in each lens parameter, and one in fy / fx being as in the mean."""
 
     mean: FloatArray  # (n_params,)
     sigma: FloatArray  # (n_params,)
@@ -56,9 +56,10 @@ class LensPrior:
         """Information matrix (n_params, n_params) at the mean, the aspect term included."""
         information = np.diag(self.sigma**-2.0)
         if np.isfinite(self.aspect_sigma):
-            # fy - fx = 0 within aspect_sigma * f
+            # fy - a fx = 0 within aspect_sigma * f, a of the mean: 1 unless a lens is known
+            a = self.mean[1] / self.mean[0]
             sigma_px = max(self.aspect_sigma, SQUARE_SIGMA) * self.mean[0]
-            information[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / sigma_px**2
+            information[:2, :2] += np.array([[a * a, -a], [-a, 1.0]]) / sigma_px**2
         return information
 
 

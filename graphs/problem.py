@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphs.camera import Camera, project
+from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 
 IntArray = NDArray[np.int64]
@@ -146,6 +148,37 @@ class BoardPoints:
         return self.corner >= 0
 
 
+# start: where the solve begins, and no more. weak: the generic beliefs in lenses are centred on it.
+# full: it is believed as far as its own covariance says.
+PriorMode = Literal["start", "weak", "full"]
+
+
+@dataclass(frozen=True)
+class PriorRig:
+    """An earlier calibration of a problem's cameras, and what is made of it.
+
+    Lengths are metres, or in units of one camera's baseline: then only their ratios count.
+    """
+
+    cameras: tuple[Camera, ...]  # those of the problem that it knows, the reference among them
+    cam_from_rig: tuple[Transform, ...]  # of each; the reference's is the identity
+    reference: str
+    covariance: Covariance  # in this frame and unit; a parameter without a row is not stated
+    metric: bool
+    mode: PriorMode = "full"
+    unit: str | None = None  # whose baseline is 1, where not metric; None: its lengths say nothing
+    held: frozenset[str] = frozenset()  # parameters held at its values, named as in a covariance
+
+    @property
+    def gives_scale(self) -> bool:
+        """Whether it says how long a baseline is in metres."""
+        told = self.held | (set(self.covariance.names) if self.mode == "full" else set())
+        return self.metric and any(
+            placed.translation.any() and f"{camera.name}.translation_x" in told
+            for camera, placed in zip(self.cameras, self.cam_from_rig, strict=True)
+        )
+
+
 @dataclass(frozen=True)
 class Problem:
     """Everything the graph needs: observations, and where to start."""
@@ -156,6 +189,7 @@ class Problem:
     reference: int = 0  # index of the camera whose frame is the rig's frame
     scales: tuple[ScaleSource, ...] = ()  # measured distances
     board: BoardPoints | None = None
+    prior: PriorRig | None = None  # an earlier calibration
 
     @property
     def known(self) -> BoolArray:
@@ -180,8 +214,9 @@ class Problem:
 
     @property
     def metric(self) -> bool:
-        """Whether lengths of the rig are in metres: measured, or seen against a board."""
-        return bool(self.scales) or self.board_gives_scale
+        """Whether lengths of the rig are in metres: measured, seen against a board, or known."""
+        known = self.prior is not None and self.prior.gives_scale
+        return bool(self.scales) or self.board_gives_scale or known
 
     @property
     def board_gives_scale(self) -> bool:

@@ -15,9 +15,10 @@ import numpy as np
 from graphs.build import GraphOptions
 from graphs.frames import FloatArray
 from graphs.jackknife import change, tangent
+from graphs.joint_prior import believed, centred_covariance, displaced, parameters
 from graphs.model_covariance import calibration_columns
 from graphs.noise import redundancies
-from graphs.problem import BoardPoints, Estimate, Problem, residuals_px
+from graphs.problem import BoardPoints, Estimate, PriorRig, Problem, residuals_px
 from graphs.refine import Refinement, refine
 from graphs.scale import length_of
 from graphs.stated_covariance import calibration_covariance, factors
@@ -85,7 +86,7 @@ def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
     """The optimum seen anew: exact projections, and lengths of noise drawn from the residuals'.
 
     Directions are drawn evenly, each length is scaled by the sigma of its observation, and
-    each measured distance errs by its sigma.
+    each measured distance errs by its sigma, as does an earlier calibration that is believed.
     """
     problem, estimate = refinement.problem, refinement.estimate
     seen = problem.observations
@@ -108,6 +109,7 @@ def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
         observations=replace(seen, pixels=exact + noise),
         scales=scales,
         board=_stated_anew(problem.board, estimate, rng),
+        prior=None if problem.prior is None else _drawn_anew(problem.prior, estimate, rng),
     )
 
 
@@ -120,6 +122,23 @@ def _stated_anew(
     sigma = board.board.shape_sigma
     mean = truth.board_shape + sigma * rng.standard_normal(len(sigma))
     return replace(board, board=replace(board.board, shape_mean=mean))
+
+
+def _drawn_anew(prior: PriorRig, truth: Estimate, rng: np.random.Generator) -> PriorRig:
+    """An earlier calibration that errs from the truth by its own covariance.
+
+    What is held of it does not err: the sigmas that twins judge are those of the rest given it.
+    """
+    names, known = parameters(prior), believed(prior)
+    held = np.array([name in prior.held for name in names])
+    free = np.array([name in known for name in names]) & ~held
+    error = np.zeros(len(names))
+    if free.any():
+        whole = centred_covariance(prior)
+        of_held = factors(whole[np.ix_(held, held)])[1] @ whole[np.ix_(held, free)]
+        root = factors(whole[np.ix_(free, free)] - of_held.T @ of_held)[0]
+        error[free] = root @ rng.standard_normal(root.shape[1])
+    return displaced(prior, truth, error)
 
 
 def _judge(

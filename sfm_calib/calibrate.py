@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphs.build import GraphOptions
+from graphs.consider import completed, sensitivity
 from graphs.ladder import Ladder, climb, on_rung_of
 from graphs.losses import SCALE_95, LossName
 from graphs.motion import too_little_motion
@@ -155,7 +156,7 @@ def options_of(problem: Problem, config: RigConfig) -> GraphOptions:
     return GraphOptions(
         loss=loss,
         loss_scale=SCALE_95[loss],
-        lens_priors=lens_priors(problem.initial, config, problem.board is not None),
+        lens_priors=lens_priors(problem.initial, config, problem.board is not None, problem.prior),
         rig_priors=rig_priors(problem.initial, config, problem.reference, problem.metric),
         shared_lenses=shared_lenses(problem, config),
     )
@@ -240,7 +241,11 @@ def covariance_of(
             graph, estimate, values, parallax,
             on_block=lambda done, total: progress("leaving out frames", done, total),
         )  # fmt: skip
-        return covariance, split_check(graph, estimate, covariance, parallax)
+        split = split_check(graph, estimate, covariance, parallax)
+        if refinement.problem.prior is not None:  # what halves lean on both has been counted there
+            how = sensitivity(graph, estimate, values, covariance.basis)
+            covariance = completed(covariance, how)
+        return covariance, split
 
 
 def certificate_of(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +31,7 @@ from sfm_calib.commands import (
     Check,
     Command,
     Demo,
+    Recalibrate,
     Simulate,
     SimulateTracks,
     Target,
@@ -43,15 +42,17 @@ from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.convert_command import Convert, run_convert
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
+from sfm_calib.history_command import HistoryCommand, run_history
 from sfm_calib.images import camera_names, check_exists
-from sfm_calib.report import TruthRow, write_report
-from sfm_calib.result import load_calibration, save_calibration
+from sfm_calib.output import finish, output_folder, told
+from sfm_calib.recalibrate_command import run_recalibrate
+from sfm_calib.result import load_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.tracks import simulate_tracks, write_tracks
 from sfm_calib.target import calibrate_target
-from sfm_calib.terminal import print_comparison, print_result, progress_bars, result_console
+from sfm_calib.terminal import progress_bars, result_console
+from sfm_calib.undistort_command import Rectify, Undistort, run_rectify, run_undistort
 
-LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 EXIT_BAD_INPUT = 2
 DEMO_FRAMES = 24
 DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the same result
@@ -64,14 +65,21 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
     default = Calibrate(tyro.MISSING, tyro.MISSING, config.options())
     calibrate_type = Annotated[Calibrate, tyro.conf.subcommand("calibrate", default=default)]
     target_default = Target(tyro.MISSING, tyro.MISSING, tyro.MISSING, config.target_options())
+    recalibrate_default = Recalibrate(
+        tyro.MISSING, tyro.MISSING, tyro.MISSING, options=config.options()
+    )
     check_default = Check(tyro.MISSING, None, config.options())
     commands: Any = (
         calibrate_type
+        | Annotated[Recalibrate, tyro.conf.subcommand("recalibrate", default=recalibrate_default)]
         | Annotated[Target, tyro.conf.subcommand("target", default=target_default)]
         | Annotated[BoardCommand, tyro.conf.subcommand("board")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Convert, tyro.conf.subcommand("convert")]
+        | Annotated[HistoryCommand, tyro.conf.subcommand("history")]
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
+        | Annotated[Undistort, tyro.conf.subcommand("undistort")]
+        | Annotated[Rectify, tyro.conf.subcommand("rectify")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -94,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     quiet_decoders()
     try:
-        run(parse(arguments), arguments)
+        return run(parse(arguments), arguments)
     except CalibrationError as error:
         print(f"sfm-calib: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
@@ -124,8 +132,10 @@ def quiet_decoders() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
-def run(command: Command, arguments: Sequence[str]) -> None:
-    """Do what a parsed command asks for."""
+def run(command: Command, arguments: Sequence[str]) -> int:
+    """Do what a parsed command asks for; the exit code."""
+    if isinstance(command, Recalibrate):
+        return run_recalibrate(command, config_of(command.scan, arguments), arguments)
     if isinstance(command, Calibrate):
         run_calibrate(command, arguments)
     elif isinstance(command, Target):
@@ -137,8 +147,17 @@ def run(command: Command, arguments: Sequence[str]) -> None:
             run_compare(command)
     elif isinstance(command, Convert):
         run_convert(command)
+    elif isinstance(command, HistoryCommand):
+        with output_folder(command.out) if command.out else nullcontext():
+            run_history(command)
     elif isinstance(command, Check):
         run_check(command, arguments)
+    elif isinstance(command, Undistort):
+        with output_folder(command.out):
+            run_undistort(command, told(arguments))
+    elif isinstance(command, Rectify):
+        with output_folder(command.out):
+            run_rectify(command, told(arguments))
     elif isinstance(command, Simulate):
         with progress_bars() as progress:
             simulate_scan(command.options, command.out, progress, command.overwrite)
@@ -149,6 +168,7 @@ def run(command: Command, arguments: Sequence[str]) -> None:
         print(f"{len(problem.observations)} observations written to {command.out}")
     else:
         run_demo(command)
+    return 0
 
 
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
@@ -201,11 +221,6 @@ def run_board(command: BoardCommand) -> None:
     print(f"{page} and {description} written; print at 100 % and check the rulers")
 
 
-def told(arguments: Sequence[str]) -> str:
-    """The command line, for the result to tell."""
-    return shlex.join(["sfm-calib", *arguments]).encode(errors="backslashreplace").decode()
-
-
 def run_check(command: Check, arguments: Sequence[str]) -> None:
     """Check a scan, in a cache that is kept where -o says so."""
     config = config_of(command.scan, arguments)
@@ -242,7 +257,7 @@ def config_of(scan: Path, arguments: Sequence[str]) -> RigConfig:
     check_exists(scan)
     from_file = load_rig_config(rig_file(scan))
     again = parse(arguments, from_file)
-    assert isinstance(again, Calibrate | Check)
+    assert isinstance(again, Calibrate | Check | Recalibrate)
     return from_file.with_options(again.options)
 
 
@@ -268,64 +283,6 @@ def calibrate_into(
         if board is None:
             return calibrate(scan, config, cache, progress, line)
         return calibrate_with_board(scan, board, board_images, config, cache, progress, line)
-
-
-@contextmanager
-def output_folder(out: Path) -> Iterator[None]:
-    """OUT, made where it is missing, and gone again where nothing was written to it.
-
-    Raises CalibrationError now rather than after the work when OUT cannot be written.
-    """
-    missing = [path for path in (out, *out.parents) if not path.exists()]
-    try:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=out):
-                pass
-            free = shutil.disk_usage(out).free
-        except OSError as error:
-            reason = "it is a file" if out.is_file() else error.strerror
-            raise CalibrationError(
-                f"cannot write to {out}: {reason}; choose another output folder with -o"
-            ) from error
-        if free < LEAST_FREE:
-            raise CalibrationError(
-                f"only {free / 1e6:.1f} MB are free in {out}, and results need "
-                f"{LEAST_FREE / 1e6:.0f} MB at least: free some space or choose another output "
-                "folder with -o"
-            )
-        yield
-    finally:
-        with suppress(OSError):  # as soon as one of them holds something
-            for path in missing:
-                path.rmdir()
-
-
-def finish(outcome: Outcome, out: Path, rows: Sequence[TruthRow], as_json: bool) -> None:
-    """Write calibration.json and report.html, both or none, and print the result."""
-    calibration = outcome.calibration
-    write_results(outcome, out, rows)
-    if as_json:
-        print(calibration.model_dump_json(indent=1))
-        return
-    console = result_console()
-    print_result(calibration, console)
-    if rows:
-        print_comparison(rows, console)
-    console.print(f"{out / 'calibration.json'} and {out / 'report.html'} written", soft_wrap=True)
-
-
-def write_results(outcome: Outcome, out: Path, rows: Sequence[TruthRow]) -> None:
-    """The report is written under another name until calibration.json is in its place."""
-    refinement = outcome.refinement
-    scaled = refinement.estimate.scaled(outcome.unit)
-    report = out / ".report.html"
-    try:
-        write_report(outcome.calibration, refinement.problem, scaled, report, rows)
-        save_calibration(outcome.calibration, out / "calibration.json")
-        os.replace(report, out / "report.html")
-    finally:
-        report.unlink(missing_ok=True)
 
 
 def run_demo(command: Demo) -> None:

@@ -11,21 +11,28 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from graphs.camera import Camera, nominal_params
+from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from graphs.problem import Observations
 from graphs.rig_start import FreeModel
-from sfm_calib.colmap_lenses import LENS_OF_MODEL, MAPPING_MODEL, in_model, out_of_model
+from sfm_calib.colmap_lenses import (
+    LENS_OF_MODEL,
+    MAPPING_MODEL,
+    fisheye_guess,
+    in_model,
+    out_of_model,
+)
 from sfm_calib.errors import CalibrationError
+from sfm_calib.features import Features
 from sfm_calib.images import Progress, Scan
+from sfm_calib.mapping_attempts import MappingAttempt
 from sfm_calib.pairs import Pair
 
 VERSION = pycolmap.__version__
@@ -34,7 +41,6 @@ PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
 GLOBAL_ADJUSTMENT_GROWTH = 1.3  # of the model between two global adjustments
-FISHEYE_FOCAL = 0.5  # of the longer side: some 115 degrees across
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
 # COLMAP's names of its parameters, where they are not ours.
@@ -112,7 +118,7 @@ def extract_features(
         reader.default_focal_length_factor = DEFAULT_FOCAL
         start = known.get(index)
         if start is None and LENS_OF_MODEL[reader.camera_model] == "kannala_brandt":
-            start = _fisheye_guess(scan, index)
+            start = fisheye_guess(scan.cameras[index], scan.sizes[index])
         if start is not None:
             reader.camera_params = ",".join(
                 map(repr, colmap_camera(start, reader.camera_model).params.tolist())
@@ -132,11 +138,30 @@ def extract_features(
             progress("extracting features", done := done + len(batch), len(scan.images))
 
 
-def _fisheye_guess(scan: Scan, index: int) -> Camera:
-    # COLMAP verifies no pair of a fisheye whose focal length is its own guess.
-    size = scan.sizes[index]
-    params = nominal_params("kannala_brandt", size, FISHEYE_FOCAL * max(size))
-    return Camera(scan.cameras[index], "kannala_brandt", size, params)
+def write_features(
+    scan: Scan,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    features: Sequence[Features],
+    database: Path,
+) -> None:
+    """A database of features found elsewhere, one set an image; cameras as `extract_features`,
+    but for EXIF, which is not looked at."""
+    with pycolmap.Database.open(database) as db:
+        for index, lens in enumerate(lenses):
+            model = MAPPING_MODEL[lens]
+            start = known.get(index)
+            if start is None and LENS_OF_MODEL[model] == "kannala_brandt":
+                start = fisheye_guess(scan.cameras[index], scan.sizes[index])
+            camera = colmap_camera(start or _unseen_camera(scan, lenses, index), model, index + 1)
+            camera.has_prior_focal_length = start is not None
+            db.write_camera(camera, use_camera_id=True)
+        for number, (image, found) in enumerate(zip(scan.images, features, strict=True), 1):
+            entry = pycolmap.Image(name=image.path, camera_id=image.camera + 1, image_id=number)
+            db.write_image(entry, use_image_id=True)
+            db.write_keypoints(number, (found.pixels + PIXEL_OFFSET).astype(np.float32))
+            sift = pycolmap.FeatureExtractorType.SIFT
+            db.write_descriptors(number, pycolmap.FeatureDescriptors(sift, found.descriptors))
 
 
 def _read_image(database: Path, path: str) -> pycolmap.Image:
@@ -274,24 +299,6 @@ def read_models(place: Path) -> list[pycolmap.Reconstruction]:
     """The models that `write_models` kept, in its order."""
     folders = sorted((place / "best").iterdir(), key=lambda folder: int(folder.name))
     return [pycolmap.Reconstruction(folder) for folder in folders]
-
-
-@dataclass(frozen=True)
-class MappingAttempt:
-    """How one run of the incremental mapper is started."""
-
-    seed: int
-    min_start_angle_deg: float
-    max_start_forward: float
-
-
-def attempts(seed: int) -> list[MappingAttempt]:
-    """COLMAP's own start first, then gentler ones: 2 of 82 images was seen with an unlucky one."""
-    return [
-        MappingAttempt(seed, 16.0, 0.95),
-        MappingAttempt(seed + 1, 8.0, 0.99),
-        MappingAttempt(seed + 2, 4.0, 1.0),
-    ]
 
 
 def map_images(

@@ -53,6 +53,16 @@ LENS_OF_MODEL: dict[str, LensName] = {
 }
 # Elements out of place, fractions of a per cent: left out without making up for them.
 LEFT_OUT = {"p1", "p2", "s1", "s2", "s3", "s4"}
+FISHEYE_FOCAL = 0.5  # of the longer side: some 115 degrees across
+
+
+def fisheye_guess(name: str, size: tuple[int, int]) -> Camera:
+    """A fisheye of which nothing is known.
+
+    COLMAP verifies no pair of one whose focal length is its own guess.
+    """
+    params = nominal_params("kannala_brandt", size, FISHEYE_FOCAL * max(size))
+    return Camera(name, "kannala_brandt", size, params)
 
 
 def in_model(camera: Camera, model: str, names: Collection[str]) -> Camera:

@@ -12,8 +12,11 @@ from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.convert_command import Convert
+from sfm_calib.history_command import HistoryCommand
+from sfm_calib.recalibrate_command import Recalibrate
 from sfm_calib.simulate.scan import SimulateOptions
 from sfm_calib.simulate.tracks import TrackOptions
+from sfm_calib.undistort_command import Rectify, Undistort
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="OUT")]
 Verbose = Annotated[bool, tyro.conf.arg(aliases=("-v",))]
@@ -142,5 +145,6 @@ class BoardCommand:
 
 
 Command = (
-    Calibrate | Target | Compare | Convert | BoardCommand | Check | Simulate | SimulateTracks | Demo
-)
+    Calibrate | Recalibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
+    | Undistort | Rectify | Simulate | SimulateTracks | Demo
+)  # fmt: skip

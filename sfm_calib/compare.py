@@ -339,7 +339,7 @@ def _pairs(sides: Sides, a: Stated, b: Stated) -> tuple[PairDifference, ...]:
     ranges = [r for r in sides.frames.ranges if np.isfinite(r)]
     names = [camera.name for camera in a.estimate.cameras]
     return tuple(
-        _pair(
+        pair_difference(
             (names[pair[0]], names[pair[1]]),
             pair_place(sides.a, sides.b, pair),
             depth_errors(a, b, pair, ranges),
@@ -350,9 +350,10 @@ def _pairs(sides: Sides, a: Stated, b: Stated) -> tuple[PairDifference, ...]:
     )
 
 
-def _pair(
+def pair_difference(
     names: tuple[str, str], place: PairPlace, depths: Sequence[DepthError], scaled: bool
 ) -> PairDifference:
+    """Of two cameras; scaled: their baselines were made as long as each other."""
     (ours, theirs), sigmas = place.baselines, place.sigma_baselines
     stated = any(cov.any() for cov in place.cov)
     longer = None if scaled or ours == 0 else 100 * (theirs / ours - 1)

@@ -37,7 +37,7 @@ class Compare:
 
 
 def run_compare(command: Compare) -> None:
-    """Compare, write and print; OUT has to be there (`cli.output_folder`).
+    """Compare, write and print; OUT has to be there (`output.output_folder`).
 
     Raises CalibrationError as `compare_files`, and where OUT cannot be written.
     """

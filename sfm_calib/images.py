@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_calib import video
 from sfm_calib.cache import Cache
@@ -159,15 +160,20 @@ def find_images(scan: Path) -> dict[str, list[Path]]:
 
 def image_size(path: Path) -> tuple[int, int] | None:
     """Width and height of an image, or None when it cannot be decoded whole."""
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads it
+    image = read_image(path, flags)
+    return None if image is None else (image.shape[1], image.shape[0])
+
+
+def read_image(path: Path, flags: int) -> NDArray[Any] | None:
+    """An image as cv2.imdecode gives it, or None when it cannot be decoded whole."""
     try:
         data = path.read_bytes()
     except OSError:
         return None
     if not data or not (_whole_png(data) and _whole_jpeg(data)):
         return None  # decoders fill a truncated image with grey
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads it
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    return None if image is None else (image.shape[1], image.shape[0])
+    return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 
 
 def _whole_png(data: bytes) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from graphs.camera import Camera
-from graphs.frames import Transform
+from graphs.frames import FloatArray, Transform
 from graphs.join import join_models
 from graphs.lenses import LensName
 from graphs.problem import Problem
@@ -19,8 +19,9 @@ from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
+from sfm_calib.mapping_attempts import attempts
 from sfm_calib.nominal import nominal_rig
-from sfm_calib.pairs import choose_pairs
+from sfm_calib.pairs import Pair, choose_pairs
 from sfm_calib.worker import run_apart
 
 DATABASE = "database.db"
@@ -74,17 +75,34 @@ def map_scan(
     place = cache.stage(
         "models",
         inputs,
-        lambda place: run_apart(_map, (scan, config, nominal, database, place), progress),
+        lambda place: run_apart(map_matched, (scan, config, nominal, database, place), progress),
     )
+    scales = colmap.keypoint_scales(database)
+    problem, messages = problem_of(scan, config, lenses, place, database, scales)
+    return Mapped(problem, messages, hashes)
+
+
+def problem_of(
+    scan: Scan,
+    config: RigConfig,
+    lenses: Sequence[LensName],
+    place: Path,
+    database: Path,
+    scales: dict[str, FloatArray],
+) -> tuple[Problem, tuple[str, ...]]:
+    """The rig out of the models in `place`, mapped from `database`, and what was left out.
+
+    scales: as `colmap.keypoint_scales`. Raises CalibrationError when a camera cannot be placed.
+    """
+    reference = reference_of(scan, config)
     try:
         found = colmap.read_models(place)
-        scales = colmap.keypoint_scales(database)
         models = [colmap.free_model(model, scan, lenses, scales) for model in found]
     except (OSError, ValueError) as error:
         raise CalibrationError(f"{place} is damaged: run again with --fresh") from error
     model, cam_from_rig = _one_model(scan, models, reference, database)
     problem, dropped = impose_rig(model, cam_from_rig, scan.frames, reference)
-    return Mapped(problem, _messages(scan, model, dropped), hashes)
+    return problem, _messages(scan, model, dropped)
 
 
 def _extract(
@@ -109,7 +127,11 @@ def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress:
         config.seed,
     )
     colmap.match_features(scan, pairs, database, config.seed, progress)
-    counts = colmap.match_counts(scan, database)
+    check_overlap(scan, colmap.match_counts(scan, database))
+
+
+def check_overlap(scan: Scan, counts: dict[Pair, int]) -> None:
+    """Raises CalibrationError where no pair of images has enough verified matches."""
     best = max(counts.values(), default=0)
     if best < MIN_MATCHES:
         raise CalibrationError(
@@ -118,7 +140,7 @@ def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress:
         )
 
 
-def _map(
+def map_matched(
     scan: Scan,
     config: RigConfig,
     nominal: tuple[Transform, ...] | None,
@@ -129,7 +151,7 @@ def _map(
     """Map freely, from several starts until most images are registered, and with the nominal rig
     imposed where one is given; keep what explains most."""
     best = (0, 0, 0)
-    for number, attempt in enumerate(colmap.attempts(config.seed)):
+    for number, attempt in enumerate(attempts(config.seed)):
         models = colmap.map_images(scan, database, place / f"free{number}", attempt, progress)
         best = _keep_better(models, scan, place, best)
         if best[1] >= ENOUGH_REGISTERED * len(scan.images):
@@ -138,7 +160,7 @@ def _map(
         constrained = place / "rig.db"
         shutil.copyfile(database, constrained)
         colmap.constrain_rig(scan, nominal, reference_of(scan, config), constrained)
-        attempt = colmap.attempts(config.seed)[0]
+        attempt = attempts(config.seed)[0]
         models = colmap.map_images(scan, constrained, place / "rig", attempt, progress)
         best = _keep_better(models, scan, place, best)
     if best[1] == 0:

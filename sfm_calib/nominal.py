@@ -9,9 +9,10 @@ import numpy as np
 
 from graphs.camera import Camera, nominal_params
 from graphs.frames import Transform
+from graphs.joint_prior import with_prior
 from graphs.lenses import FOCAL_AND_CENTRE, PARAMETER_NAMES, LensName
 from graphs.priors import LensPrior, RigPrior, stated_lens_prior, weak_lens_prior
-from graphs.problem import Estimate, Problem
+from graphs.problem import Estimate, PriorRig, Problem
 from sfm_calib.config import CameraConfig, RigConfig
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.images import Scan
@@ -168,15 +169,17 @@ def with_params(camera: Camera, given: dict[str, float]) -> Camera:
 
 
 def lens_priors(
-    start: Estimate, config: RigConfig, with_board: bool = False
+    start: Estimate, config: RigConfig, with_board: bool = False, earlier: PriorRig | None = None
 ) -> tuple[LensPrior, ...]:
-    """The weak prior of each lens, with what rig.yaml states in its place."""
+    """The weak prior of each lens, with what an earlier calibration and rig.yaml state in its
+    place."""
     priors = []
     for camera in start.cameras:
         said = camera_config(config, camera.name)
         weak = weak_lens_prior(
             camera, config.principal_point_sigma, config.aspect_sigma, with_board
         )
+        weak = with_prior(camera, weak, earlier)
         priors.append(stated_lens_prior(camera, weak, said.params, said.sigma, said.fixed))
     return tuple(priors)
 

@@ -15,6 +15,8 @@ from graphs.lenses import PARAMETER_NAMES, LensName
 from sfm_calib.board_record import BoardResult
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
+from sfm_calib.provenance import Provenance, Sha256
+from sfm_calib.recalibration_record import Recalibration
 from sfm_calib.record import Record
 
 FORMAT: Final = "sfm_calib/1"
@@ -34,6 +36,9 @@ class CameraResult(Record):
     )  # var_posterior / var_prior: 1 belief alone, 0 data alone
     n_images: int = 0
     n_observations: int = 0
+    kept_from: Sha256 | Literal[""] = (
+        ""  # of the old calibration, where the scan had no such camera
+    )
 
     @model_validator(mode="after")
     def _params_are_those_of_the_lens(self) -> CameraResult:
@@ -305,20 +310,6 @@ class Solve(Record):
     seconds: dict[str, float] = Field(default_factory=dict)
 
 
-class Provenance(Record):
-    """What made the result: enough to make it again."""
-
-    version: str
-    versions: dict[str, str] = Field(default_factory=dict)
-    command: str = ""
-    config: dict[str, object] = Field(default_factory=dict)
-    seed: int = 0
-    input_hashes: dict[str, str] = Field(default_factory=dict)
-    pixel_convention: Literal["OpenCV: the centre of the top-left pixel is (0, 0)"] = (
-        "OpenCV: the centre of the top-left pixel is (0, 0)"
-    )
-
-
 class Calibration(Record):
     """The result of a calibration, or the truth of a simulation."""
 
@@ -332,6 +323,7 @@ class Calibration(Record):
     lens_choice: LensChoice | None = None  # None: every camera's lens was given
     verdict: Verdict | None = None
     solve: Solve | None = None
+    recalibration: Recalibration | None = None  # None: it started from no calibration
     provenance: Provenance = Field(default_factory=lambda: Provenance(version=""))
 
     @model_validator(mode="after")
@@ -340,6 +332,14 @@ class Calibration(Record):
             raise ValueError("rig.cam_from_rig and cameras must name the same cameras")
         if self.rig.reference not in self.cameras:
             raise ValueError(f"the reference {self.rig.reference!r} is none of the cameras")
+        return self
+
+    @model_validator(mode="after")
+    def _kept_cameras_are_marked(self) -> Calibration:
+        marked = {name for name, camera in self.cameras.items() if camera.kept_from}
+        kept = set(self.recalibration.kept) if self.recalibration else set()
+        if marked != kept:
+            raise ValueError("recalibration.kept must name the cameras that have a kept_from")
         return self
 
     def camera(self, name: str) -> Camera:

@@ -14,6 +14,7 @@ from graphs.budget import Budget
 from graphs.build import root_information
 from graphs.covariance import Covariance
 from graphs.frames import Transform
+from graphs.joint_prior import baseline_sigma, shares_of_prior
 from graphs.ladder import Ladder, RungResult
 from graphs.observability import observe
 from graphs.problem import Problem, images_seen, residuals_px
@@ -22,6 +23,7 @@ from graphs.refine import Refinement
 from graphs.scale import total_sigma_m
 from sfm_calib import result
 from sfm_calib.board_summary import board_result
+from sfm_calib.provenance import Provenance
 from sfm_calib.run import Run
 from sfm_calib.scale import in_words
 from sfm_calib.scale_ledger import entries_of, ledger_of
@@ -132,6 +134,7 @@ def _typical_sigma_px(refinement: Refinement) -> float:
 def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]:
     graph, seen = run.refinement.graph, run.refinement.problem.observations
     sigma, model = covariance.sigma, run.covariance.model
+    earlier = shares_of_prior(graph.problem.prior, model, graph.problem.metric)
     entries = {}
     for index, camera in enumerate(run.refinement.estimate.cameras):
         own = {p: sigma.get(f"{camera.name}.{p}", 0.0) for p in camera.names}
@@ -144,6 +147,7 @@ def _cameras(run: Run, covariance: Covariance) -> dict[str, result.CameraResult]
         if np.isfinite(prior.aspect_sigma):
             ratio = model.of_difference(f"{camera.name}.fy", f"{camera.name}.fx")
             share["fy/fx"] = min((ratio / camera.params[0] / prior.aspect_sigma) ** 2, 1.0)
+        share |= {p: earlier[n] for p in camera.names if (n := f"{camera.name}.{p}") in earlier}
         rows = seen.camera == index
         entries[camera.name] = result.CameraResult(
             lens=camera.lens,
@@ -213,6 +217,9 @@ def _scale(run: Run) -> result.Scale:
     if problem.board is not None and run.board is not None and problem.board_gives_scale:
         sigmas.append(float(problem.board.board.shape_sigma[0]))
         words.append(f"board: {run.board.board.described}")
+    if problem.prior is not None and problem.prior.gives_scale:
+        sigmas.append(baseline_sigma(problem.prior))
+        words.append("the earlier calibration")
     best = words[int(np.argmin(sigmas))]
     others = len(sigmas) - 1
     together = float(np.sum(np.array(sigmas) ** -2.0)) ** -0.5
@@ -267,8 +274,8 @@ def _selection(budget: Budget | None) -> result.Selection | None:
     return None if budget is None else result.Selection(**asdict(budget))
 
 
-def _provenance(run: Run) -> result.Provenance:
-    return result.Provenance(
+def _provenance(run: Run) -> Provenance:
+    return Provenance(
         version=sfm_calib.__version__,
         versions={"python": platform.python_version()}
         | {name: version(name) for name in LIBRARIES},

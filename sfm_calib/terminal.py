@@ -85,9 +85,9 @@ class ResultConsole(Console):
         raise BrokenPipeError
 
 
-def result_console() -> Console:
+def result_console(piped_width: int = PIPED_WIDTH) -> Console:
     """Stdout; names are printed as they are, whatever brackets or colons they hold."""
-    width = None if sys.stdout.isatty() else PIPED_WIDTH
+    width = None if sys.stdout.isatty() else piped_width
     return ResultConsole(width=width, markup=False, emoji=False, highlight=False)
 
 
@@ -98,7 +98,11 @@ def print_result(calibration: Calibration, console: Console) -> None:
         print_line(
             console,
             f"{name}: {camera.lens}, {camera.size[0]} x {camera.size[1]} px, "
-            f"{camera.n_images} images, {camera.n_observations} observations",
+            + (
+                "not in the scan: kept as the old calibration has it"
+                if camera.kept_from
+                else f"{camera.n_images} images, {camera.n_observations} observations"
+            ),
         )
         table = table_of("", "value", "sigma", "of noise alone", "from priors", "")
         for parameter in PARAMETER_NAMES[camera.lens]:

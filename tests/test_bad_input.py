@@ -9,7 +9,7 @@ import pytest
 from synthetic.scans import panning_frames, picture, simulation, video
 from test_result import rig
 
-from sfm_calib import cli
+from sfm_calib import cli, output
 from sfm_calib.cli import main
 from sfm_calib.errors import CalibrationError
 from sfm_calib.result import save_calibration
@@ -112,7 +112,7 @@ def test_out_that_cannot_be_written(tmp_path, capsys, out, reason):
 
 def test_a_disk_with_little_room(tmp_path, capsys, monkeypatch):
     rig_of_noise(tmp_path / "scan")
-    monkeypatch.setattr(cli, "LEAST_FREE", 1 << 62)
+    monkeypatch.setattr(output, "LEAST_FREE", 1 << 62)
     assert main(["calibrate", str(tmp_path / "scan"), "-o", str(tmp_path / "out")]) == 2
     assert "MB are free in" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
@@ -177,7 +177,7 @@ def small_disk(tmp_path):
 
 
 def test_a_disk_that_fills_halfway(small_disk, capfd, monkeypatch):
-    monkeypatch.setattr(cli, "LEAST_FREE", 0)  # it fills up later than at the start
+    monkeypatch.setattr(output, "LEAST_FREE", 0)  # it fills up later than at the start
     out = small_disk / "out"
     save_calibration(rig(), out / "calibration.json")
     kept = (out / "calibration.json").read_bytes()
@@ -198,11 +198,11 @@ def test_results_are_written_both_or_none(tmp_path, monkeypatch, fails):
     def fail(*_):
         raise CalibrationError("cannot write OUT: No space left on device")
 
-    monkeypatch.setattr(cli, "write_report", lambda *args: args[3].write_text("new"))
+    monkeypatch.setattr(output, "write_report", lambda *args: args[3].write_text("new"))
     monkeypatch.setattr(cli, fails, fail)
     outcome = type("Outcome", (), {"refinement": _Anything(), "calibration": rig(), "unit": 1.0})()
     with pytest.raises(CalibrationError):
-        cli.write_results(outcome, out, [])
+        output.write_results(outcome, out, [])
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
 

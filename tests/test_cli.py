@@ -48,6 +48,9 @@ def test_a_calibration_is_written_and_printed(finished):
     assert set(calibration.cameras) == {"cam0", "cam1"}
     assert calibration.provenance.config["max_features"] == 250
     assert calibration.provenance.command.startswith("sfm-calib calibrate")
+    assert calibration.provenance.created is not None
+    written = (out / "calibration.json").stat().st_mtime
+    assert abs(calibration.provenance.created.timestamp() - written) < 60
     for part in (", 320 x 240 px, 8 images", "cam1.rotation_z", "report.html written"):
         assert part in text
     stages = [line.split(" ")[0] for line in text.splitlines() if line[:1].islower()]
@@ -68,6 +71,10 @@ def test_json_is_all_of_stdout_and_the_cache_is_used(tmp_path, finished, capfd):
     first = json.loads((finished[0] / "calibration.json").read_text())
     assert again["cameras"] == first["cameras"] and again["rig"] == first["rig"]
     assert json.loads((out / "calibration.json").read_text()) == again
+    for told in (first, again):  # all else is the same when made again
+        assert told["provenance"].pop("created") and told["provenance"].pop("command")
+        assert told["solve"].pop("seconds")
+    assert again == first
 
 
 def test_version(capsys):
@@ -75,7 +82,10 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"sfm-calib {sfm_calib.__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["calibrate", "simulate", "simulate-tracks", "demo"])
+@pytest.mark.parametrize(
+    "command",
+    ["calibrate", "history", "undistort", "rectify", "simulate", "simulate-tracks", "demo"],
+)
 def test_every_flag_is_explained(capsys, command):
     with pytest.raises(SystemExit) as caught:
         main([command, "--help"])

@@ -15,6 +15,7 @@ from sfm_calib import colmap
 from sfm_calib.cache import Cache
 from sfm_calib.colmap_lenses import EXACT_MODEL, LENS_OF_MODEL, MAPPING_MODEL
 from sfm_calib.images import read_scan
+from sfm_calib.mapping_attempts import attempts
 
 
 def quiet(stage: str, done: int, total: int) -> None:
@@ -32,7 +33,7 @@ def mapped(scan, place):
     with sqlite3.connect(database) as db:
         tables = ("images", "cameras", "keypoints", "descriptors", "two_view_geometries")
         content = {t: db.execute(f"select * from {t} order by 1").fetchall() for t in tables}
-    models = colmap.map_images(scan, database, place / "models", colmap.attempts(0)[0], quiet)
+    models = colmap.map_images(scan, database, place / "models", attempts(0)[0], quiet)
     scales = colmap.keypoint_scales(database)
     return content, colmap.free_model(models[0], scan, ["radtan"] * 2, scales)
 

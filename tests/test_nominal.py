@@ -166,7 +166,7 @@ def test_a_nominal_rig_is_imposed_on_the_mapping(tmp_path, monkeypatch) -> None:
     )
     nominal = nominal_rig(config, scan.cameras, 0)
     (tmp_path / "models").mkdir()
-    mapping._map(scan, config, nominal, database, tmp_path / "models", lambda *done: None)
+    mapping.map_matched(scan, config, nominal, database, tmp_path / "models", lambda *done: None)
     assert calls == ["free0", "free1", "free2", "rig"]
     found = colmap.read_models(tmp_path / "models")[0]
     model = colmap.free_model(found, scan, ["radtan"] * 2, colmap.keypoint_scales(database))

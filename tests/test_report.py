@@ -14,6 +14,7 @@ from graphs.camera import Camera, project
 from graphs.frames import Transform
 from graphs.problem import Estimate, Observations, Problem, points_in_cameras, residuals_px
 from sfm_calib.errors import CalibrationError
+from sfm_calib.provenance import Provenance
 from sfm_calib.report import TruthRow, write_report
 from sfm_calib.report.correlation import correlation_matrix, strongest_pairs
 from sfm_calib.report.image_plane import cell_counts, cell_means, noise_of_cell_mean
@@ -25,7 +26,6 @@ from sfm_calib.result import (
     Calibration,
     Covariance,
     Noise,
-    Provenance,
     Scale,
     Solve,
     Verdict,

@@ -1,6 +1,7 @@
 """calibration.json: written whole, read strictly."""
 
 import json
+from datetime import datetime, timedelta, timezone
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
+from sfm_calib.provenance import Provenance, Replaced
+from sfm_calib.recalibration_record import Contribution, OldFile, Recalibration
 from sfm_calib.result import (
     Calibration,
     LensChoice,
@@ -128,3 +131,61 @@ def test_what_is_not_a_number_is_not_written():
         Calibration.model_validate(
             rig().model_dump() | {"noise": {"sigma_px": float("nan"), "inflation": 1.0}}
         )
+
+
+# ---- of a recalibration --------------------------------------------------------------------
+
+HASH = "0" * 63 + "f"
+OLD = OldFile(path="old.yaml", sha256=HASH, format="Kalibr")
+
+
+def recalibrated():
+    known = Contribution(old=500.0, sigma_old=None, result=501.0, sigma=0.1, prior_share=0.2)
+    record = Recalibration(
+        old=OLD, prior="weak", freed=("intrinsics of left",), kept=("right",), drift="keep",
+        contributions={"left.fx": known},
+    )  # fmt: skip
+    right = rig().cameras["right"].model_copy(update={"kept_from": HASH})
+    provenance = Provenance(
+        version="1",
+        created=datetime(2026, 5, 4, 3, 2, 1, 999, timezone(timedelta(hours=2))),
+        replaces=Replaced(path="old.yaml", sha256=HASH),
+    )
+    cameras = rig().cameras | {"right": right}
+    update = {"cameras": cameras, "recalibration": record, "provenance": provenance}
+    return Calibration.model_validate((rig().model_copy(update=update)).model_dump())
+
+
+def test_what_became_of_an_old_calibration_is_read_again(tmp_path):
+    save_calibration(recalibrated(), tmp_path / "c.json")
+    assert load_calibration(tmp_path / "c.json") == recalibrated()
+    written = json.loads((tmp_path / "c.json").read_text())
+    assert written["provenance"]["created"] == "2026-05-04T01:02:01Z"
+
+
+def test_files_from_before_recalibrations_are_read(tmp_path):
+    content = json.loads(rig().model_dump_json())
+    del content["recalibration"], content["provenance"]["created"]
+    del content["provenance"]["replaces"], content["cameras"]["left"]["kept_from"]
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    assert load_calibration(tmp_path / "c.json") == rig()
+
+
+WRONG_RECORDS = {
+    "another prior": ("recalibration.prior", "strong", "recalibration.prior: "),
+    "no hash": ("recalibration.old.sha256", "f00", "recalibration.old.sha256: "),
+    "an unknown key": ("recalibration.why", "", "recalibration.why: Extra inputs"),
+    "no mark": ("cameras.right.kept_from", "", "must name the cameras that have a kept_from"),
+    "kept and added": ("recalibration.added", ["right"], "right cannot be both kept and added"),
+    "a moment of no zone": ("provenance.created", "2026-05-04T01:02:01", "provenance.created: "),
+}
+
+
+@pytest.mark.parametrize(("key", "value", "message"), WRONG_RECORDS.values(), ids=WRONG_RECORDS)
+def test_what_is_wrong_with_a_recalibration_is_named(tmp_path, key, value, message):
+    content = json.loads(recalibrated().model_dump_json())
+    set_in(content, key, value)
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(tmp_path / "c.json")
+    assert message in str(caught.value)

@@ -7,7 +7,7 @@ have no names and its lengths no unit.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,8 @@ from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.colmap_lenses import LENS_OF_MODEL, out_of_model
 from sfm_calib.errors import CalibrationError
+from sfm_calib.formats.bounded import bounded_bytes
+from sfm_calib.formats.numbers import image_size, numbers
 from sfm_calib.formats.reading import CameraRig
 
 FORMAT = "COLMAP model"
@@ -39,6 +41,8 @@ MODELS: dict[int, tuple[str, str]] = {
 }
 # Models that our own mapping never writes; equidistant, as kannala_brandt with few coefficients.
 FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
+LONGEST_REASON = 100  # characters: it may quote the file
+LARGEST_ID = 2**32 - 1
 CAMERA_SENSOR = 0  # in binary; in text CAMERA
 
 
@@ -60,7 +64,8 @@ def read_colmap(folder: Path) -> CameraRig:
         cameras = dict(_text_cameras(folder) if text else _binary_cameras(folder))
         rigs = _text_rigs(folder) if text else _binary_rigs(folder)
     except (ValueError, IndexError, struct.error) as error:
-        raise CalibrationError(f"{folder} is no whole COLMAP model: {error}") from error
+        said = str(error)[:LONGEST_REASON]
+        raise CalibrationError(f"{folder} is no whole COLMAP model: {said}") from error
     if not cameras:
         raise CalibrationError(f"{folder} is a COLMAP model without cameras")
     rig, notes = _rig_of_all(folder, rigs, sorted(cameras))
@@ -83,40 +88,54 @@ def _rig_of_all(
     return None, (f"{folder} holds no rig of all its {len(ids)} cameras: each is compared alone",)
 
 
-def _camera(
-    folder: Path, camera_id: int, model: str, size: tuple[int, int], values: list[float]
+def model_camera(
+    path: Path, name: str, model: str, size: tuple[int, int], values: Sequence[float]
 ) -> Camera:
-    names = next((names.split() for name, names in MODELS.values() if name == model), None)
+    """The camera of one of COLMAP's models and its parameters.
+
+    Raises CalibrationError for a model that no lens here is, and for parameters that cannot be.
+    """
+    names = next((names.split() for known, names in MODELS.values() if known == model), None)
     if names is None:
         raise CalibrationError(
-            f"{folder}: camera {camera_id} is {model}, which no lens here is: of COLMAP's there "
-            f"are {', '.join(name for name, _ in MODELS.values())}"
+            f"{path}: {name} is {model[:40]}, which no lens here is: of COLMAP's there are "
+            f"{', '.join(known for known, _ in MODELS.values())}"
         )
+    values = numbers(f"{path}: {model} of {name}", values, len(names)).tolist()
     found = dict(zip(names, values, strict=True))
     if "f" in found:
         found |= {"fx": found["f"], "fy": found["f"]}
+    if not (found["fx"] > 0 and found["fy"] > 0):
+        raise CalibrationError(f"{path}: {name} has a focal length that is not positive")
     found |= {"cx": found["cx"] - PIXEL_OFFSET, "cy": found["cy"] - PIXEL_OFFSET}
     source = "RADIAL_FISHEYE" if model in FISHEYES else model
     lens: LensName = LENS_OF_MODEL[source]
-    return out_of_model(f"camera{camera_id}", size, source, found, lens)
+    return out_of_model(name, size, source, found, lens)
+
+
+def _placed(q_and_t: Sequence[float]) -> Transform:
+    """From a quaternion wxyz and a translation, seven numbers."""
+    values = numbers("the place of a camera in the rig", q_and_t, 7).tolist()
+    return Transform.from_wxyz(values[:4], values[4:])
 
 
 # ---- text ----------------------------------------------------------------------------------
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
-    for line in path.read_text("utf-8").splitlines():
+    for line in bounded_bytes(path).decode("utf-8").splitlines():
         if line.strip() and not line.startswith("#"):
             yield line.split()
 
 
 def _text_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
-    for camera_id, model, width, height, *values in _rows(folder / "cameras.txt"):
-        size = (int(width), int(height))
-        yield (
-            int(camera_id),
-            _camera(folder, int(camera_id), model, size, [float(v) for v in values]),
-        )
+    for number, model, width, height, *values in _rows(folder / "cameras.txt"):
+        if not 0 <= int(number) <= LARGEST_ID:
+            raise ValueError(f"{number[:20]} is no number of a camera")
+        name = f"camera{int(number)}"
+        size = image_size(f"{folder}: {name}", width, height)
+        params = [float(value) for value in values]
+        yield int(number), model_camera(folder, name, model, size, params)
 
 
 def _text_rigs(folder: Path) -> list[list[Sensor]]:
@@ -131,9 +150,8 @@ def _text_rig(row: list[str]) -> list[Sensor]:
     rest = rest[2:]
     while rest:
         kind, number, has_pose = rest[0], int(rest[1]), rest[2] == "1"
-        q_and_t = [float(v) for v in rest[3:10]] if has_pose else []
         if kind == "CAMERA":
-            placed = Transform.from_wxyz(q_and_t[:4], q_and_t[4:]) if has_pose else None
+            placed = _placed([float(v) for v in rest[3:10]]) if has_pose else None
             sensors.append(Sensor(number, placed))
         rest = rest[10 if has_pose else 3 :]
     return sensors
@@ -146,7 +164,7 @@ class _Bytes:
     """Reads numbers one after the other."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = path.read_bytes(), 0
+        self.data, self.at = bounded_bytes(path), 0
 
     def take(self, kinds: str) -> tuple[float, ...]:
         found: tuple[float, ...] = struct.unpack_from(f"<{kinds}", self.data, self.at)
@@ -164,8 +182,10 @@ def _binary_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
                 "lens here is"
             )
         model, names = MODELS[model_id]
-        values = list(file.take(f"{len(names.split())}d"))
-        yield camera_id, _camera(folder, camera_id, model, (width, height), values)
+        values = file.take(f"{len(names.split())}d")
+        name = f"camera{camera_id}"
+        size = image_size(f"{folder}: {name}", width, height)
+        yield camera_id, model_camera(folder, name, model, size, values)
 
 
 def _binary_rigs(folder: Path) -> list[list[Sensor]]:
@@ -180,8 +200,7 @@ def _binary_rigs(folder: Path) -> list[list[Sensor]]:
             placed: Transform | None = Transform.identity()
             if number:
                 has_pose = bool(file.take("B")[0])
-                q_and_t = file.take("7d") if has_pose else ()
-                placed = Transform.from_wxyz(q_and_t[:4], q_and_t[4:]) if has_pose else None
+                placed = _placed(file.take("7d")) if has_pose else None
             if kind == CAMERA_SENSOR:
                 sensors.append(Sensor(sensor_id, placed))
         rigs.append(sensors)

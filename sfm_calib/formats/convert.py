@@ -14,14 +14,20 @@ from graphs.camera import Camera, carries_over, fit_lens, image_pixels, project,
 from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
 from sfm_calib.errors import CalibrationError
+from sfm_calib.formats.colmap_export import COLMAP
 from sfm_calib.formats.file_storage_writing import OPENCV_FORMATS
 from sfm_calib.formats.kalibr_writing import KALIBR_FORMAT
+from sfm_calib.formats.mrcal import MRCAL
+from sfm_calib.formats.nerf import NERF
 from sfm_calib.formats.ours_writing import OURS_FORMAT
 from sfm_calib.formats.reading import NO_SIZE, NOTHING, CameraRig
 from sfm_calib.formats.ros_writing import ROS_FORMAT
+from sfm_calib.formats.urdf import URDF
 from sfm_calib.formats.writing import Export, Format
 
-FormatName = Literal["sfm_calib", "kalibr", "opencv", "opencv_xml", "opencv_json", "ros"]
+FormatName = Literal[
+    "sfm_calib", "kalibr", "opencv", "opencv_xml", "opencv_json", "ros", "colmap",
+    "mrcal", "nerf", "urdf"]  # fmt: skip
 FORMATS: dict[FormatName, Format] = {
     "sfm_calib": OURS_FORMAT,
     "kalibr": KALIBR_FORMAT,
@@ -29,6 +35,10 @@ FORMATS: dict[FormatName, Format] = {
     "opencv_xml": OPENCV_FORMATS["xml"],
     "opencv_json": OPENCV_FORMATS["json"],
     "ros": ROS_FORMAT,
+    "colmap": COLMAP,
+    "mrcal": MRCAL,
+    "nerf": NERF,
+    "urdf": URDF,
 }
 # Names of files that say what they hold; a .yaml or .json alone does not.
 GUESSES: tuple[tuple[str, FormatName], ...] = (
@@ -36,6 +46,7 @@ GUESSES: tuple[tuple[str, FormatName], ...] = (
     ("*camchain*.yaml", "kalibr"),
     ("*camchain*.yml", "kalibr"),
     ("*.xml", "opencv_xml"),
+    ("*transforms*.json", "nerf"),
 )
 BY_SUFFIX: dict[tuple[FormatName, str], FormatName] = {
     ("opencv", ".xml"): "opencv_xml",

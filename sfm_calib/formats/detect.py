@@ -8,14 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from sfm_calib.errors import CalibrationError
+from sfm_calib.formats.bounded import bounded_bytes
 from sfm_calib.formats.caliscope import cameras_in, read_caliscope
-from sfm_calib.formats.colmap_model import read_colmap
 from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS, read_file_storage
 from sfm_calib.formats.kalibr import read_kalibr
+from sfm_calib.formats.mrcal import SUFFIX, looks_like_mrcal, read_mrcal, read_mrcal_files
+from sfm_calib.formats.nerf import NAME as TRANSFORMS
+from sfm_calib.formats.nerf import looks_like_nerf, read_nerf
 from sfm_calib.formats.ours import read_ours
 from sfm_calib.formats.projection_matrices import looks_like_matrices, read_matrices
 from sfm_calib.formats.qualisys import read_qualisys
 from sfm_calib.formats.reading import CameraRig
+from sfm_calib.formats.rig_config import NAME as RIG_CONFIG
+from sfm_calib.formats.rig_config import (
+    looks_like_rig_config,
+    read_colmap_folder,
+    read_rig_config,
+)
 from sfm_calib.formats.ros import read_ros, read_ros_pair
 from sfm_calib.formats.trees import (
     MOST_BYTES,
@@ -31,10 +40,11 @@ from sfm_calib.formats.trees import (
 
 KNOWN = (
     "sfm_calib's calibration.json, OpenCV FileStorage (YAML, XML, JSON), ROS camera_info, "
-    "a COLMAP model's folder, Kalibr's camchain, Caliscope's camera_array.toml, Qualisys' "
-    ".qca.txt, KITTI's calib.txt"
+    "a COLMAP model's folder or rig_config.json, Kalibr's camchain, mrcal's .cameramodel, NeRF's "
+    "transforms.json, Caliscope's camera_array.toml, Qualisys' .qca.txt, KITTI's calib.txt"
 )
 COLMAP_FILES = ("cameras.txt", "cameras.bin")
+JSON_FILES = (RIG_CONFIG, TRANSFORMS)
 YAML_SUFFIXES = (".yaml", ".yml")
 
 
@@ -76,7 +86,7 @@ def _colmap(folder: Path) -> CameraRig:
     for name in (*COLMAP_FILES, "rigs.txt", "rigs.bin"):
         if (folder / name).exists():
             check_length(folder / name)
-    return read_colmap(folder)
+    return read_colmap_folder(folder)
 
 
 def _folder(folder: Path) -> CameraRig:
@@ -84,6 +94,11 @@ def _folder(folder: Path) -> CameraRig:
         return _colmap(folder)
     if (folder / "calibration.json").is_file():
         return read_ours(folder / "calibration.json")
+    for name in JSON_FILES:
+        if (folder / name).is_file():
+            return read_calibration(folder / name)
+    if models := sorted(p for p in folder.iterdir() if p.suffix == SUFFIX):
+        return read_mrcal_files({p: bounded_bytes(p).decode("utf-8", "replace") for p in models})
     found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
     for path in found:
         if path.stem in (INTRINSICS, EXTRINSICS):
@@ -100,7 +115,9 @@ def _folder(folder: Path) -> CameraRig:
 def _text(path: Path, text: str, start: str) -> CameraRig:
     if start.startswith("<"):
         return _xml(path, start)
-    if start.startswith("{"):
+    if looks_like_mrcal(start):
+        return read_mrcal(path, start)
+    if start.startswith("{") or _is_json_list(start):
         return _json(path, start)
     if start.startswith("%YAML") or "!!opencv-matrix" in text:
         return read_file_storage(path, text)
@@ -121,6 +138,11 @@ def _toml(text: str) -> Mapping[str, Any]:
         return {}
 
 
+def _is_json_list(start: str) -> bool:
+    """A list of objects; TOML's tables start with [ too."""
+    return start.startswith("[") and start[1:].lstrip().startswith("{")
+
+
 def _xml(path: Path, text: str) -> CameraRig:
     root = xml_root(path, text)
     if root.tag == "opencv_storage":
@@ -132,8 +154,12 @@ def _xml(path: Path, text: str) -> CameraRig:
 
 def _json(path: Path, text: str) -> CameraRig:
     content = json_tree(path, text)
+    if looks_like_rig_config(content):
+        return read_rig_config(path, content)
     if not isinstance(content, Mapping):
         raise CalibrationError(_unknown(path))
+    if looks_like_nerf(content):
+        return read_nerf(path, content)
     if "cameras" in content or str(content.get("format", "")).startswith("sfm_calib"):
         return read_ours(path)
     return read_file_storage(path, text)

@@ -9,13 +9,17 @@ import numpy as np
 from graphs.covariance import Covariance
 from graphs.propagation import marginal
 from sfm_calib.formats.reading import NOTHING, CameraRig, LengthUnit
-from sfm_calib.result import load_calibration
+from sfm_calib.result import Calibration, load_calibration
 from sfm_calib.uncertainty import unit_of
 
 
 def read_ours(path: Path) -> CameraRig:
     """A calibration.json with its joint covariance; a truth.json has none."""
-    calibration = load_calibration(path)
+    return rig_of(load_calibration(path), path)
+
+
+def rig_of(calibration: Calibration, path: Path) -> CameraRig:
+    """A result as if it had been read from a file."""
     names = tuple(calibration.cameras)
     stated = Covariance(calibration.covariance.names, np.array(calibration.covariance.matrix))
     known = [name for name in stated.names if name.rpartition(".")[0] in names]

@@ -7,7 +7,7 @@ from graphs.lenses import LENS_NAMES
 from sfm_calib.files import sha256
 from sfm_calib.formats.reading import CameraRig
 from sfm_calib.formats.writing import Export, Format, of_camera
-from sfm_calib.result import Provenance
+from sfm_calib.provenance import Provenance
 
 
 def write_ours(rig: CameraRig) -> Export:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,7 +91,11 @@ def render_comparison(record: Comparison, found: Difference) -> str:
         z_figure=figure_html(shown, "z") if shown else "",
         taken_out=taken_out(record),
         cameras=camera_maps(record, found),
-        depth_figure=figure_html(depth_figure(record), "depth") if _has_depth(record) else "",
+        depth_figure=(
+            figure_html(depth_figure(record.pairs, record.unit), "depth")
+            if has_depth(record.pairs)
+            else ""
+        ),
         at_range=at_range,
         p_text=p_text,
         px_text=px_text,
@@ -203,19 +208,24 @@ def map_figure(found: Difference, camera: int, which: int, reach: float) -> tupl
 # ---- depths --------------------------------------------------------------------------------
 
 
-def _has_depth(record: Comparison) -> bool:
-    return any(one.median_percent is not None for pair in record.pairs for one in pair.depth)
+def has_depth(pairs: Sequence[PairDifference]) -> bool:
+    """Whether any pair has a depth."""
+    return any(one.median_percent is not None for pair in pairs for one in pair.depth)
 
 
-def depth_figure(record: Comparison) -> go.Figure:
+def depth_figure(
+    pairs: Sequence[PairDifference], unit: str | None, sides: tuple[str, str] = ("A", "B")
+) -> go.Figure:
     """Error of A's depths against range, a line a pair, from the middle to the worst."""
     figure = go.Figure()
-    for index, pair in enumerate(record.pairs):
-        _add_pair(figure, pair, camera_colour(index), record.unit)
+    for index, pair in enumerate(pairs):
+        _add_pair(figure, pair, camera_colour(index), unit)
     styled(figure, height=380)
-    unit = "baselines" if record.unit == "baseline" else record.unit
-    figure.update_xaxes(title=f"range from the pair's first camera, {unit}", type="log")
-    figure.update_yaxes(title="depth by A where B is true, % of it", zeroline=True)
+    words = "baselines" if unit == "baseline" else unit
+    figure.update_xaxes(title=f"range from the pair's first camera, {words}", type="log")
+    figure.update_yaxes(
+        title=f"depth by {sides[0]} where {sides[1]} is true, % of it", zeroline=True
+    )
     return figure
 
 

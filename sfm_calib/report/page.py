@@ -12,9 +12,11 @@ from plotly.offline import get_plotlyjs
 
 from graphs.problem import Estimate, Problem
 from sfm_calib.files import write_atomically
+from sfm_calib.provenance import Provenance
 from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
+from sfm_calib.report.drift import drift_section
 from sfm_calib.report.headline import banner, key_figures, truth_summary
 from sfm_calib.report.image_plane import (
     arrows_figure,
@@ -45,7 +47,7 @@ from sfm_calib.report.sigmas import sigma_section
 from sfm_calib.report.theme import Panel, figure_html, page_template
 from sfm_calib.report.uncertainty import uncertainty_section
 from sfm_calib.report.weak import length_unit, weak_cards
-from sfm_calib.result import Calibration, Provenance
+from sfm_calib.result import Calibration
 
 TITLE = "Calibration report"
 
@@ -101,6 +103,7 @@ def render(
     lenses = camera_tables(calibration, truth_rows)
     rig = rig_tables(calibration, truth_rows) if is_rig else ()
     has_covariance = bool(calibration.covariance.names)
+    drift = calibration.recalibration.drift if calibration.recalibration else None
     return page_template("page.html").render(
         title=title,
         calibration=calibration,
@@ -113,6 +116,7 @@ def render(
         rig_tables=rig,
         board=board_section(calibration, problem, estimate),
         scale_ledger=ledger_section(calibration),
+        drift=drift_section(drift) if drift else "",
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
         truth_summary=truth_summary(truth_rows),
@@ -194,8 +198,11 @@ def stages(calibration: Calibration) -> tuple[Stage, ...]:
 def provenance_lines(provenance: Provenance) -> tuple[tuple[str, str], ...]:
     """Where the result came from, as pairs of term and text."""
     libraries = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
+    old = provenance.replaces
     lines = (
         ("sfm_calib", provenance.version or "unknown"),
+        ("Written", provenance.created.isoformat() if provenance.created else ""),
+        ("Replaces", f"{old.path} (SHA-256 {old.sha256})" if old else ""),
         ("Command", provenance.command),
         ("Seed", str(provenance.seed)),
         ("Libraries", libraries),

@@ -143,6 +143,8 @@ def marked(
 
 def _camera_caption(entry: CameraResult) -> str:
     caption = f"{entry.lens}, {entry.size[0]} × {entry.size[1]} px"
+    if entry.kept_from:
+        caption += "; not in the scan: kept as the old calibration has it"
     if entry.n_images:
         caption += f", {entry.n_images:,} images, {entry.n_observations:,} observations"
     if entry.prior_share.get("fy/fx", 0.0) > PRIOR_DECIDES_SHARE:

@@ -86,8 +86,12 @@ class TrackOptions(BaseModel):
     """Sigma of the measured first baseline, the problem's scale; 0: none measured."""
 
 
-def simulate_tracks(options: TrackOptions, rng: np.random.Generator) -> tuple[Problem, Estimate]:
+def simulate_tracks(
+    options: TrackOptions, rng: np.random.Generator, rig: SimulatedRig | None = None
+) -> tuple[Problem, Estimate]:
     """Tracks of a preset rig on a preset trajectory, and the truth of every variable.
+
+    rig: in place of the preset; the first camera's frame is its own.
 
     Points with fewer than `min_track_length` observations and frames with fewer than
     MIN_OBSERVATIONS_A_FRAME are left out of both. Frame names are those of the whole trajectory.
@@ -95,7 +99,7 @@ def simulate_tracks(options: TrackOptions, rng: np.random.Generator) -> tuple[Pr
     Raises CalibrationError for impossible options, and when nothing remains.
     """
     check_options(options)
-    rig = make_rig(options.rig, options.lens, options.size)
+    rig = rig or make_rig(options.rig, options.lens, options.size)
     rig_from_world = tuple(make_trajectory(options.trajectory, options.frames, rng))
     points = scene_points(options.scene, options.points, rng)
     whole = Estimate(rig.cameras, rig.cam_from_rig, rig_from_world, points)

@@ -1,0 +1,234 @@
+"""The tests of a drift: one for each group of each camera, and what each could have found."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from graphs.camera import Camera
+from graphs.compare import Stated
+from graphs.covariance import Covariance
+from graphs.drift_picture import GROUPS, Group, Picture, lens_columns, picture, share
+from graphs.drift_places import Places, frame_changes
+from graphs.frames import FloatArray, log_rotation
+from graphs.pose_covariance import form_names, poses_as
+from graphs.problem import Estimate
+from graphs.propagation import cross_covariance, lens_names
+from graphs.significance import detectable, holm, significance
+
+Tested = Literal[Group, "lens", "places"]  # lens: all of it; places: of all cameras together
+Freed = tuple[frozenset[Group], ...]  # of each camera, what the new solve freed
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """By what is judged."""
+
+    systematic_px: float = 0.1  # rms over an image, all groups together: allowed beside the sigmas
+    matters_px: float = 1.0  # a drift that must be found, for the old calibration to be kept
+    alpha: float = 0.05  # chance of drift found in all tests together where there is none
+    power: float = 0.95  # chance of finding what is called detectable
+    range: float = 2.0  # of the points in which a change of place is judged, in the unit of length
+    depth_ranges: tuple[float, ...] = (1.0, 2.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class GroupDrift:
+    """One test: how a group of parameters changed, new less old.
+
+    rotation (rad, about the camera's axes): where the camera points, with the turn that the change
+    of its lens amounts to. translation: of its centre, along its own axes. Both in the frame of the
+    other cameras. Of a pair: of the second, seen from the first.
+    """
+
+    cameras: tuple[int, ...]  # one; the pair, where it cannot be told which; or all
+    group: Tested
+    names: tuple[str, ...]
+    change: FloatArray  # (k,)
+    sigma: FloatArray  # (k,) by both covariances, nothing allowed beside them
+    chi2: float
+    dof: int
+    p_value: float
+    p_corrected: float  # Holm's, of all tests
+    effect_px: float  # rms over the image; of translation at `Criteria.range`, and as 1 / range
+    expected_px: float  # rms that chance lets expect, with what is allowed beside it
+    detectable_px: float  # every change of this effect is found with `Criteria.power`
+
+
+@dataclass(frozen=True)
+class Row:
+    """A test before it is made."""
+
+    cameras: tuple[int, ...]
+    group: Tested
+    names: tuple[str, ...]
+    change: FloatArray  # (k,)
+    sigma: FloatArray  # (k,)
+    change_px: FloatArray  # (m,) as long as the effect is large
+    cov_px: FloatArray  # (m, m) with what is allowed
+
+
+def judged(rows: Sequence[Row], criteria: Criteria) -> tuple[GroupDrift, ...]:
+    """All tests together: each is corrected for the others."""
+    results = [significance(row.change_px, row.cov_px) for row in rows]
+    corrected = holm([result.p_value for result in results])
+    return tuple(
+        GroupDrift(
+            row.cameras, row.group, row.names, row.change, row.sigma,
+            result.chi2, result.dof, result.p_value, float(p),
+            float(np.linalg.norm(row.change_px)),
+            max(float(np.trace(row.cov_px)), 0.0) ** 0.5,
+            detectable(row.cov_px, criteria.alpha / len(rows), criteria.power),
+        )
+        for row, result, p in zip(rows, results, corrected, strict=True)
+    )  # fmt: skip
+
+
+# ---- changes -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Changes:
+    """New less old, of every parameter: lenses, and places as left twists."""
+
+    estimate: Estimate  # the old one
+    pictures: tuple[Picture, ...]
+    freed: Freed
+    names: tuple[str, ...]
+    change: FloatArray  # (n,)
+    cov: FloatArray  # (n, n)
+
+    def lens_of(self, camera: int) -> list[int]:
+        """Columns of a camera's lens."""
+        first = self.names.index(lens_names(self.estimate.cameras[camera])[0])
+        return list(range(first, first + len(self.estimate.cameras[camera].names)))
+
+
+def changes(
+    old: Stated, new: Stated, distance: float, freed: Freed, cov_difference: Covariance | None
+) -> Changes:
+    """Of two calibrations in one frame and unit; lens groups that were not freed did not change."""
+    names: list[str] = []
+    apart, held = [], []
+    for index, camera in enumerate(old.estimate.cameras):
+        a, b = (side.estimate.cam_from_rig[index] for side in (old, new))
+        turn = b.rotation @ a.rotation.T
+        apart += [new.estimate.cameras[index].params - camera.params]
+        apart += [log_rotation(turn), b.translation - turn @ a.translation]
+        names += [*lens_names(camera), *form_names(camera.name, "left_twist")]
+        for group, columns in lens_columns(camera):
+            if group not in freed[index]:
+                held += [names.index(lens_names(camera)[column]) for column in columns]
+    sides = [old, new] if cov_difference is None else [Stated(new.estimate, cov_difference)]
+    cov = np.zeros((len(names), len(names)))
+    for side in sides:
+        as_twists = poses_as(side.covariance, side.estimate, "left_twist")
+        cov += cross_covariance(as_twists, names, names)
+    change = np.concatenate(apart)
+    change[held], cov[held], cov[:, held] = 0.0, 0.0, 0.0
+    pictures = tuple(
+        picture(_between(a, b), distance)
+        for a, b in zip(old.estimate.cameras, new.estimate.cameras, strict=True)
+    )
+    return Changes(old.estimate, pictures, freed, tuple(names), change, cov)
+
+
+def _between(a: Camera, b: Camera) -> Camera:
+    # Halfway, derivatives leave out nothing of second order.
+    return replace(a, params=(a.params + b.params) / 2)
+
+
+# ---- lenses --------------------------------------------------------------------------------
+
+
+def of_lenses(of: Changes, systematic_px: float) -> Iterator[Row]:
+    """Each lens's groups by themselves, and all of it."""
+    for camera, (lens, seen) in enumerate(zip(of.estimate.cameras, of.pictures, strict=True)):
+        groups: list[tuple[Tested, list[int]]] = [
+            (group, columns) for group, columns in lens_columns(lens) if group in of.freed[camera]
+        ]
+        together = [column for _, columns in groups for column in columns]
+        if len(groups) > 1:
+            groups.append(("lens", together))
+        for group, columns in groups:
+            rows = [of.lens_of(camera)[column] for column in columns]
+            change, cov, R = of.change[rows], of.cov[np.ix_(rows, rows)], seen.of_lens(columns)
+            n_groups = len(groups) - 1 if group == "lens" else 1
+            allowed = share(systematic_px, len(rows), n_groups) * np.eye(len(rows))
+            yield Row(
+                (camera,), group, tuple(lens.names[column] for column in columns), change,
+                np.sqrt(np.maximum(np.diag(cov), 0.0)), R @ change, R @ cov @ R.T + allowed,
+            )  # fmt: skip
+
+
+# ---- places --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PlaceTests:
+    """How all cameras' places changed, and what it takes to say so in radians and lengths."""
+
+    places: Places
+    cov_stated: FloatArray  # (6 n, 6 n) px^2, nothing allowed beside it
+    pictures: tuple[Picture, ...]
+    freed: Freed
+
+    @property
+    def suspects(self) -> list[int]:
+        """Cameras whose place was free."""
+        return [i for i, groups in enumerate(self.freed) if groups & set(GROUPS[3:])]
+
+    def rows(self, moved: Collection[int] = ()) -> Iterator[Row]:
+        """Each camera in the frame of those others that did not move, then all together."""
+        n = self.places.n_cameras
+        if n == 1 or not self.suspects:
+            return
+        for camera in range(n) if n > 2 else moved or (1,):
+            of = (camera,) if n > 2 or moved else (0, 1)
+            free = frozenset[Group]().union(*(self.freed[i] for i in of))
+            left = self.places.in_frame_of(set(range(n)) - {camera} - set(moved))
+            for part, group in enumerate(GROUPS[3:]):
+                if group in free:
+                    yield self._row(of, group, left, 6 * camera + 3 * part)
+        free_px, basis = self.places.without_frames(range(n))
+        yield Row(
+            tuple(range(n)), "places", (), np.zeros(0), np.zeros(0), free_px / n**0.5,
+            basis.T @ self.places.cov @ basis / n,
+        )  # fmt: skip
+
+    def _row(self, of: tuple[int, ...], group: Group, left: FloatArray, first: int) -> Row:
+        part = left[first : first + 3]
+        seen = self.pictures[first // 6]
+        # The centre moves against the twist: cam_from_rig takes points to the camera.
+        in_px = seen.turn if group == "rotation" else -seen.move
+        natural = np.linalg.inv(in_px)
+        change_px = part @ self.places.change
+        sigma = np.sqrt(np.diag(natural @ part @ self.cov_stated @ part.T @ natural.T))
+        return Row(
+            of, group, AXES, natural @ change_px, sigma, change_px, part @ self.places.cov @ part.T
+        )
+
+
+def of_places(of: Changes, systematic_px: float, scale: bool) -> PlaceTests:
+    """Where cameras point, and their places; scale: the size of the rig is taken out."""
+    n = len(of.pictures)
+    in_px, roots = np.zeros((6 * n, len(of.names))), []
+    for camera, seen in enumerate(of.pictures):
+        lens = of.lens_of(camera)
+        first, rows = lens[-1] + 1, slice(6 * camera, 6 * camera + 6)
+        root = np.zeros((6, 6))
+        root[:3, :3], root[3:, 3:] = seen.turn, seen.move
+        in_px[rows, first : first + 6] = root
+        in_px[rows, lens[0] : first] = root[:, :3] @ seen.pointing
+        roots.append(root)
+    cov = in_px @ of.cov @ in_px.T
+    places = Places(
+        in_px @ of.change,
+        cov + share(systematic_px, 3) * np.eye(6 * n),
+        frame_changes(of.estimate.cam_from_rig, roots, scale),
+    )
+    return PlaceTests(places, cov, of.pictures, of.freed)

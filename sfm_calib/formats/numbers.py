@@ -1,0 +1,43 @@
+"""Numbers of files that anyone wrote: finite, of the right shape, or refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphs.frames import FloatArray
+from sfm_calib.errors import CalibrationError
+
+LARGEST = 1e9  # of any number of a calibration: what is made of it stays finite
+LARGEST_SIDE_PX = 100_000
+
+
+def numbers(what: str, entry: object, *shape: int) -> FloatArray:
+    """An entry as finite numbers of this shape; -1 is any length.
+
+    Raises CalibrationError, which never repeats the entry: it may be as long as the file.
+    """
+    try:
+        found = np.asarray(entry, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise CalibrationError(f"{what} holds something else than numbers") from error
+    wanted = " x ".join("any" if n < 0 else str(n) for n in shape) or "one"
+    if found.ndim != len(shape) or any(
+        n >= 0 and n != m for n, m in zip(shape, found.shape, strict=True)
+    ):
+        raise CalibrationError(f"{what} has {found.size} numbers, not {wanted}")
+    if not (np.abs(found) <= LARGEST).all():  # nor where it is NaN
+        raise CalibrationError(f"{what} holds numbers that are not finite, or beyond {LARGEST:.0e}")
+    return found
+
+
+def number(what: str, entry: object) -> float:
+    """One finite number. Raises CalibrationError."""
+    return float(numbers(what, entry))
+
+
+def image_size(what: str, width: object, height: object) -> tuple[int, int]:
+    """Width and height in px. Raises CalibrationError where they are none."""
+    sides = numbers(what, [width, height], 2)
+    if (sides != np.floor(sides)).any() or not ((sides > 0) & (sides <= LARGEST_SIDE_PX)).all():
+        raise CalibrationError(f"{what} is no size of an image: {sides[0]:g} x {sides[1]:g} px")
+    return int(sides[0]), int(sides[1])

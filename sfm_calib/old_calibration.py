@@ -1,0 +1,144 @@
+"""The old calibration of a rig, in a scan's terms: names, units, image sizes and sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphs.compare import Stated
+from graphs.compare_rig import pair_place
+from graphs.drift_picture import assumed_covariance
+from sfm_calib.compare_sides import renamed
+from sfm_calib.config import BaselineConfig, RigConfig
+from sfm_calib.drift import EXACT, DriftOptions
+from sfm_calib.errors import CalibrationError, nearest
+from sfm_calib.formats import CameraRig
+from sfm_calib.images import Scan
+from sfm_calib.partial import reference_of, stated_of
+from sfm_calib.prior import checked
+from sfm_calib.uncertainty import Unit
+
+LEAST_RELATIVE = 1e-6  # sigma of a baseline that a file without sigmas, or a truth, gives
+
+
+@dataclass(frozen=True)
+class OldCalibration:
+    """What a scan is told of an old calibration; all its cameras, also those the scan lacks."""
+
+    rig: CameraRig  # names as the scan's; in metres, else in units of its longest baseline
+    unit: Unit | None  # None: one camera, or no place is known
+    assumed: bool  # its sigmas are: the file states none
+    notes: tuple[str, ...]
+
+    @property
+    def stated(self) -> Stated:
+        """Its values with the covariance that it states or is assumed to have."""
+        return stated_of(self.rig)
+
+    @property
+    def own(self) -> Stated:
+        """With what it states itself: nothing, where its sigmas are assumed."""
+        return Stated(self.stated.estimate, EXACT) if self.assumed else self.stated
+
+    def common(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Of these cameras, those that it has."""
+        return tuple(name for name in names if name in self.rig.names)
+
+    def reference(self, names: Sequence[str]) -> str:
+        """Whose frame is the rig's in a scan of these cameras: its own reference's, if there."""
+        own = reference_of(self.rig)
+        return own if own in names else self.common(names)[0]
+
+    def baseline(self, names: Sequence[str]) -> BaselineConfig | None:
+        """Its longest distance from the reference to a camera of the scan, where it has metres."""
+        if self.unit != "m":
+            return None
+        reference = self.reference(names)
+        estimate, covariance = self.stated.estimate, self.stated.covariance
+        origin = estimate.cam_from_rig[self.rig.names.index(reference)].inverse.translation
+        apart = {
+            name: estimate.cam_from_rig[self.rig.names.index(name)].inverse.translation - origin
+            for name in self.common(names)
+        }
+        far = max(apart, key=lambda name: float(np.linalg.norm(apart[name])))
+        length = float(np.linalg.norm(apart[far]))
+        if length <= 0:
+            return None
+        pair = (self.rig.names.index(reference), self.rig.names.index(far))
+        side = Stated(estimate, covariance)
+        sigma = pair_place(side, side, pair).sigma_baselines[0]
+        return BaselineConfig(
+            cameras=(reference, far), length_m=length, sigma_m=max(sigma, LEAST_RELATIVE * length)
+        )
+
+
+def old_calibration(
+    read: CameraRig, scan: Scan, cameras: Sequence[str], options: DriftOptions
+) -> OldCalibration:
+    """An old calibration as it was read, for a scan of its rig.
+
+    cameras: `name in OLD=name in the scan`, where the names do not tell. options: how right a file
+    without sigmas is taken to be. Raises CalibrationError where no camera is in both, where image
+    sizes differ, and where it does not say how its cameras sit.
+    """
+    named, notes = _named_as(read, scan.cameras, cameras)
+    rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
+    rig, unit = _in_unit(rig)
+    assumed = not rig.states_sigmas
+    if assumed:
+        side = stated_of(rig)
+        reference = rig.names.index(reference_of(rig))
+        covariance = assumed_covariance(
+            side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
+        )
+        rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
+    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes))
+
+
+def _named_as(
+    read: CameraRig, names: Sequence[str], wanted: Sequence[str]
+) -> tuple[CameraRig, tuple[str, ...]]:
+    """With its cameras called as the scan calls them: as wanted, by name, or else by order."""
+    called = dict(zip(read.names, read.names, strict=True))
+    for entry in (one for each in wanted for one in each.split(",")):
+        old, equals, new = entry.partition("=")
+        if not equals:
+            raise CalibrationError(f"--cameras {entry}: say NAME IN OLD=NAME IN THE SCAN")
+        for name, known, whose in ((old, read.names, str(read.path)), (new, names, "the scan")):
+            if name not in known:
+                raise CalibrationError(
+                    f"--cameras {entry}: {whose} has no camera {name!r}: {nearest(name, known)}"
+                )
+        called[old] = new
+    notes: tuple[str, ...] = ()
+    if not wanted and not set(read.names) & set(names) and len(read.names) == len(names):
+        called = dict(zip(read.names, names, strict=True))
+        said = ", ".join(f"{old} = {new}" for old, new in called.items())
+        notes = (f"cameras are called otherwise in the scan: matched by their order, {said}",)
+    if len(set(called.values())) < len(called):
+        twice = next(n for n in called.values() if list(called.values()).count(n) > 1)
+        raise CalibrationError(f"--cameras {' '.join(wanted)}: two cameras of OLD are {twice}")
+    return renamed(read, list(called.values())), notes
+
+
+def _in_unit(rig: CameraRig) -> tuple[CameraRig, Unit | None]:
+    """In metres where it has them; else its longest baseline is 1 long."""
+    if rig.cam_from_rig is None or len(rig.cameras) == 1:
+        return rig, None
+    if rig.unit == "m":
+        return rig, "m"
+    centres = np.array([t.inverse.translation for t in rig.cam_from_rig])
+    longest = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    if longest <= 0:
+        return rig, None
+    return replace(rig.metric(1 / longest), unit="baseline"), "baseline"
+
+
+def with_scale_of(config: RigConfig, known: BaselineConfig | None) -> RigConfig:
+    """The configuration with a length of the old calibration, where it measures none itself."""
+    if known is None or config.scale.measured:
+        return config
+    scale = config.scale.model_copy(update={"baseline": (known,)})
+    return config.model_copy(update={"scale": scale})

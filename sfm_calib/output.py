@@ -1,0 +1,86 @@
+"""The folder that a command writes to, and how a finished calibration is written and printed."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from sfm_calib.calibrate import Outcome
+from sfm_calib.errors import CalibrationError
+from sfm_calib.provenance import now
+from sfm_calib.report import TruthRow, write_report
+from sfm_calib.result import save_calibration
+from sfm_calib.terminal import print_comparison, print_result, result_console
+
+LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """OUT, made where it is missing, and gone again where nothing was written to it.
+
+    Raises CalibrationError now rather than after the work when OUT cannot be written.
+    """
+    missing = [path for path in (out, *out.parents) if not path.exists()]
+    try:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=out):
+                pass
+            free = shutil.disk_usage(out).free
+        except OSError as error:
+            reason = "it is a file" if out.is_file() else error.strerror
+            raise CalibrationError(
+                f"cannot write to {out}: {reason}; choose another output folder with -o"
+            ) from error
+        if free < LEAST_FREE:
+            raise CalibrationError(
+                f"only {free / 1e6:.1f} MB are free in {out}, and results need "
+                f"{LEAST_FREE / 1e6:.0f} MB at least: free some space or choose another output "
+                "folder with -o"
+            )
+        yield
+    finally:
+        with suppress(OSError):  # as soon as one of them holds something
+            for path in missing:
+                path.rmdir()
+
+
+def finish(outcome: Outcome, out: Path, rows: Sequence[TruthRow], as_json: bool) -> None:
+    """Write calibration.json and report.html, both or none, and print the result."""
+    provenance = outcome.calibration.provenance.model_copy(update={"created": now()})
+    calibration = outcome.calibration.model_copy(update={"provenance": provenance})
+    outcome = replace(outcome, calibration=calibration)
+    write_results(outcome, out, rows)
+    if as_json:
+        print(calibration.model_dump_json(indent=1))
+        return
+    console = result_console()
+    print_result(calibration, console)
+    if rows:
+        print_comparison(rows, console)
+    console.print(f"{out / 'calibration.json'} and {out / 'report.html'} written", soft_wrap=True)
+
+
+def write_results(outcome: Outcome, out: Path, rows: Sequence[TruthRow]) -> None:
+    """The report is written under another name until calibration.json is in its place."""
+    refinement = outcome.refinement
+    scaled = refinement.estimate.scaled(outcome.unit)
+    report = out / ".report.html"
+    try:
+        write_report(outcome.calibration, refinement.problem, scaled, report, rows)
+        save_calibration(outcome.calibration, out / "calibration.json")
+        os.replace(report, out / "report.html")
+    finally:
+        report.unlink(missing_ok=True)
+
+
+def told(arguments: Sequence[str]) -> str:
+    """The command line, for the result to tell."""
+    return shlex.join(["sfm-calib", *arguments]).encode(errors="backslashreplace").decode()
