@@ -198,6 +198,9 @@ def test_kalibr_chains_its_cameras(tmp_path: Path) -> None:
     assert [c.lens for c in read.cameras] == ["kannala_brandt", "radtan", "radtan"]
     assert read.unit == "m" and read.cam_from_rig is not None
     assert read.cam_from_rig[2].translation == pytest.approx((step @ step).translation)
+    assert not read.notes
+    written(path, path.read_text() + f"  T_cam_imu: {matrix.tolist()}\n")
+    assert "IMU" in read_calibration(path).notes[0]
 
 
 def test_kalibr_lenses(tmp_path: Path) -> None:

@@ -32,7 +32,11 @@ def read_kalibr(path: Path, content: Mapping[str, Any]) -> CameraRig:
         rig = _chain(path, entries)
     except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path} is no whole Kalibr camchain: {error!r}") from error
-    notes = () if rig or len(cameras) == 1 else (f"{path} has no T_cn_cnm1: no rig",)
+    notes: tuple[str, ...] = ()
+    if not rig and len(cameras) > 1:
+        notes += (f"{path} has no T_cn_cnm1: no rig",)
+    if any("T_cam_imu" in entry for entry in entries.values()):
+        notes += (f"{path}: where the IMU sits, and its time shift, are left out",)
     return CameraRig(path, FORMAT, cameras, rig, "m", notes=notes)
 
 
