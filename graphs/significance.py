@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import optimize, stats
@@ -64,6 +65,7 @@ def holm(p_values: Sequence[float]) -> FloatArray:
     return corrected
 
 
+@lru_cache(maxsize=256)
 def noncentrality(alpha: float, dof: int, power: float) -> float:
     """Of a chi-square so that a test at level alpha rejects with that power; alpha < power."""
     limit = stats.chi2.isf(alpha, dof)

@@ -125,13 +125,15 @@ def test_an_assumed_covariance_errs_by_what_is_assumed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["stereo", "triple"])
 def test_p_values_are_uniform_where_nothing_changed(name: RigName) -> None:
-    side, rng, n = rig(name), np.random.default_rng(1), 500
+    side, rng, n = rig(name), np.random.default_rng(1), 150
     found = [drift(drawn(side, rng), drawn(side, rng), EXACT) for _ in range(n)]
     # Groups are tested on the same draws: each is held to the 1e-3 of its own.
     for index, test in enumerate(found[0].tests):
         p = [one.tests[index].p_value for one in found]
         assert stats.kstest(p, "uniform").pvalue > 1e-3, (test.cameras, test.group)
-    assert np.mean([one.verdict == "replace" for one in found]) <= 0.05 + 2.6 * 0.05 / n**0.5 * 4.4
+    assert (
+        np.mean([one.verdict == "replace" for one in found]) <= stats.binom.isf(1e-3, n, 0.05) / n
+    )
 
 
 @pytest.mark.parametrize(("seed", "reference", "yaw"), [(0, 0, 1.5), (1, 1, -0.3), (2, 2, 0.0)])
@@ -241,15 +243,15 @@ def test_a_principal_point_that_a_turn_undoes_is_no_drift_but_alone_it_is_a_turn
 def test_a_centre_moves_the_way_that_is_said() -> None:
     side = rig("triple", 0.05)
     here = side.estimate.cam_from_rig[1]
-    step = np.array([0.01, -0.004, 0.006])  # along the camera's own axes
+    step = np.array([0.002, -0.0008, 0.0012])  # along the camera's own axes
     centre = here.inverse.translation + here.rotation.T @ step
     placed = list(side.estimate.cam_from_rig)
     placed[1] = Transform(here.rotation, -here.rotation @ centre)
     new = replace(side, estimate=replace(side.estimate, cam_from_rig=tuple(placed)))
     result = drift(side, new, USUAL)
     assert result.moved == ((1,),)
-    assert np.allclose(test_of(result, (1,), "translation").change, step, atol=1e-6)
-    assert np.allclose(test_of(result, (1,), "rotation").change, 0.0, atol=1e-6)
+    assert np.allclose(test_of(result, (1,), "translation").change, step, atol=5e-5)
+    assert np.allclose(test_of(result, (1,), "rotation").change, 0.0, atol=1e-5)
 
 
 # ---- the size ------------------------------------------------------------------------------
@@ -333,3 +335,26 @@ def test_the_covariance_that_is_allowed_makes_all_tests_weaker() -> None:
         return np.array([(test.detectable_px, test.expected_px) for test in tests])
 
     assert (sizes(0.3) > sizes(0.0)).all()
+
+
+def test_a_direction_that_is_hardly_known_takes_no_length_along() -> None:
+    """A measured baseline: to first order alone, a turn of it by three sigmas would shorten it."""
+    side = rig("stereo", 0.02)
+    t = side.estimate.cam_from_rig[1].translation
+    u = t / np.linalg.norm(t)
+    across = np.eye(3) - np.outer(u, u)
+    names = [f"cam1.translation_{axis}" for axis in "xyz"]
+    cov = 1e-10 * np.outer(u, u) + 0.007**2 * across
+    unsure = Stated(side.estimate, Covariance(tuple(names), cov))
+    rotated = exp_rotation(0.1 * np.linalg.svd(across)[0][:, 0])
+    here = side.estimate.cam_from_rig[1]
+    new = replace(
+        side.estimate, cam_from_rig=(Transform.identity(), replace(here, translation=rotated @ t))
+    )
+    of_new = Stated(new, Covariance(tuple(names), rotated @ cov @ rotated.T))
+    row = test_of(drift(unsure, of_new, USUAL), (0, 1), "translation")
+    assert (
+        row.chi2 < 8.1 + 0.1
+    )  # (0.1 x 0.2 m / 0.007 m)^2 at most, what is not known on both sides
+    longer = Stated(unsure.scaled(1.05).estimate, unsure.covariance)
+    assert drift(unsure, longer, USUAL).verdict == "replace"
