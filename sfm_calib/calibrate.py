@@ -233,18 +233,29 @@ def covariance_of(
     refinement: Refinement, config: RigConfig, progress: Progress
 ) -> tuple[CalibrationCovariance, SplitCheck | None]:
     """The joint covariance at the optimum, with the jackknife, and what halves of the scan say."""
-    graph, estimate, values = refinement.graph, refinement.estimate, refinement.values
-    parallax = config.min_parallax_deg
+    covariance, split = own_covariance_of(refinement, config, progress)
+    if refinement.problem.prior is not None:
+        with refusals():
+            how = sensitivity(
+                refinement.graph, refinement.estimate, refinement.values, covariance.basis
+            )
+        covariance = completed(covariance, how)
+    return covariance, split
+
+
+def own_covariance_of(
+    refinement: Refinement, config: RigConfig, progress: Progress
+) -> tuple[CalibrationCovariance, SplitCheck | None]:
+    """As `covariance_of`, but what is held of an earlier calibration counts as exactly known."""
     progress("covariance", 0, 0)
     with refusals():
         covariance = calibration_covariance(
-            graph, estimate, values, parallax,
+            refinement.graph, refinement.estimate, refinement.values, config.min_parallax_deg,
             on_block=lambda done, total: progress("leaving out frames", done, total),
         )  # fmt: skip
-        split = split_check(graph, estimate, covariance, parallax)
-        if refinement.problem.prior is not None:  # what halves lean on both has been counted there
-            how = sensitivity(graph, estimate, values, covariance.basis)
-            covariance = completed(covariance, how)
+        split = split_check(
+            refinement.graph, refinement.estimate, covariance, config.min_parallax_deg
+        )
         return covariance, split
 
 

@@ -19,7 +19,7 @@ from sfm_calib.coverage_findings import (
     MOST_FORWARD,
 )
 from sfm_calib.findings import BLURRED_PX, Finding
-from sfm_calib.terminal import with_digits
+from sfm_calib.report.digits import with_digits
 
 CAMERAS_A_TABLE = 3  # side by side in 80 columns
 UNKNOWN = "-"

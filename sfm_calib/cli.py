@@ -31,7 +31,6 @@ from sfm_calib.commands import (
     Check,
     Command,
     Demo,
-    Recalibrate,
     Simulate,
     SimulateTracks,
     Target,
@@ -45,7 +44,7 @@ from sfm_calib.files import write_atomically
 from sfm_calib.history_command import HistoryCommand, run_history
 from sfm_calib.images import camera_names, check_exists
 from sfm_calib.output import finish, output_folder, told
-from sfm_calib.recalibrate_command import run_recalibrate
+from sfm_calib.recalibrate_command import Recalibrate, run_recalibrate
 from sfm_calib.result import load_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
 from sfm_calib.simulate.tracks import simulate_tracks, write_tracks

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from sfm_calib.compare_record import Comparison, PairDifference, ParameterDifference
 from sfm_calib.compare_verdict import p_text, px_text
-from sfm_calib.report.digits import short
-from sfm_calib.terminal import SUSPICIOUS_Z, print_line, sigma_text, table_of, with_digits
+from sfm_calib.report.digits import at_range, short, sigma_text, signed_percent, with_digits
+from sfm_calib.terminal import SUSPICIOUS_Z, print_line, table_of
 
 NONE = "-"
 
@@ -86,14 +86,6 @@ def _stands_out(row: ParameterDifference) -> bool:
     return row.z is not None and abs(row.z) > SUSPICIOUS_Z
 
 
-def at_range(distance: float | None, unit: str | None) -> str:
-    """A range in words."""
-    if unit is None:
-        return "any range"
-    words = "baselines" if unit == "baseline" else unit
-    return "infinity" if distance is None else f"{distance:g} {words}"
-
-
 def _projections(record: Comparison) -> Table:
     table = table_of("in the picture, px", "range", "mean", "rms", "most", "centre", "corner")
     for name, told in record.projection.items():
@@ -148,8 +140,3 @@ def _depth_cells(pair: PairDifference, unit: str | None) -> Iterator[tuple[str, 
             *(NONE if v is None else signed_percent(v) for v in numbers),
             NONE if one.sigma_percent is None else f"{short(one.sigma_percent)} %",
         )
-
-
-def signed_percent(value: float) -> str:
-    """Per cent with a sign and two digits."""
-    return f"{'-' if value < 0 else '+'}{short(abs(value))} %"

@@ -9,7 +9,7 @@ import numpy as np
 from graphs.frames import Transform, log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.errors import CalibrationError
-from sfm_calib.report import TruthRow
+from sfm_calib.report.rows import TruthRow
 from sfm_calib.result import Calibration
 
 

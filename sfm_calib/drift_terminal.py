@@ -8,11 +8,10 @@ from rich.console import Console
 from rich.table import Table
 
 from sfm_calib.compare_record import PairDifference
-from sfm_calib.compare_terminal import at_range, signed_percent
-from sfm_calib.drift_record import DriftChange, DriftRecord
+from sfm_calib.drift_record import DriftRecord
 from sfm_calib.drift_verdict import p_text, size_text, who
-from sfm_calib.report.digits import short
-from sfm_calib.terminal import print_line, sigma_text, table_of, with_digits
+from sfm_calib.report.digits import at_range, short, signed_percent
+from sfm_calib.terminal import print_line, table_of
 
 NONE = "-"
 
@@ -52,15 +51,6 @@ def _tests(record: DriftRecord) -> Table:
             style="bold red" if test.found else "",
         )
     return table
-
-
-def change_of(one: DriftChange) -> str:
-    """A parameter's change with its sigma."""
-    name = one.name.replace("rotation_", "").replace("centre_", "")
-    factor, unit = (1000.0, "mm") if one.unit == "m" else (1.0, one.unit)
-    change, sigma = factor * one.change, factor * one.sigma
-    value = f"{name} {with_digits(change, sigma, '+')}"
-    return f"{value} ± {sigma_text(sigma)} {unit}".rstrip() if sigma > 0 else f"{value} {unit}"
 
 
 def _depths(pairs: Sequence[PairDifference], unit: str) -> Table:

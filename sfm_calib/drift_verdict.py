@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from sfm_calib.drift_record import DriftRecord, DriftTest
-from sfm_calib.report.digits import short
+from sfm_calib.drift_record import DriftChange, DriftRecord, DriftTest
+from sfm_calib.report.digits import short, sigma_text, with_digits
 
 LEAST_P = 1e-12  # smaller ones are a matter of how normal errors are so far out
 MOST_NAMED = 3  # groups in the main line
@@ -126,3 +126,12 @@ def _unseen(record: DriftRecord, of_old: bool) -> Iterator[str]:
         HELP["lens" if test.group not in HELP else test.group] for test in lost
     ):
         yield f"to see more: {help_}"
+
+
+def change_of(one: DriftChange) -> str:
+    """A parameter's change with its sigma."""
+    name = one.name.replace("rotation_", "").replace("centre_", "")
+    factor, unit = (1000.0, "mm") if one.unit == "m" else (1.0, one.unit)
+    change, sigma = factor * one.change, factor * one.sigma
+    value = f"{name} {with_digits(change, sigma, '+')}"
+    return f"{value} ± {sigma_text(sigma)} {unit}".rstrip() if sigma > 0 else f"{value} {unit}"

@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sfm_calib.history_record import GROUPS, History, HistoryEntry, Quantity
-from sfm_calib.terminal import SUSPICIOUS_Z, print_line, sigma_text, table_of, with_digits
+from sfm_calib.report.digits import sigma_text, with_digits
+from sfm_calib.terminal import SUSPICIOUS_Z, print_line, table_of
 
 NONE = "-"
 FILE_TIME = "*"  # beside a date that is the file's, not the calibration's

@@ -14,7 +14,8 @@ from pathlib import Path
 from sfm_calib.calibrate import Outcome
 from sfm_calib.errors import CalibrationError
 from sfm_calib.provenance import now
-from sfm_calib.report import TruthRow, write_report
+from sfm_calib.report.page import write_report
+from sfm_calib.report.rows import TruthRow
 from sfm_calib.result import save_calibration
 from sfm_calib.terminal import print_comparison, print_result, result_console
 

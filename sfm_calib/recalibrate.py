@@ -17,7 +17,8 @@ import tyro
 from pydantic import BaseModel, ConfigDict, Field
 
 from graphs.compare import Stated
-from graphs.consider import Sensitivity, considered, cov_difference, sensitivity
+from graphs.consider import completed as with_old_errors
+from graphs.consider import cov_difference, sensitivity
 from graphs.covariance import Covariance
 from graphs.drift_picture import Group, lens_columns
 from graphs.problem import PriorMode, PriorRig
@@ -30,8 +31,8 @@ from sfm_calib.calibrate import (
     Outcome,
     Stopwatch,
     checked_scan,
-    covariance_of,
     enough_placed,
+    own_covariance_of,
     refusals,
     solve_problem,
 )
@@ -49,7 +50,6 @@ from sfm_calib.old_calibration import OldCalibration, old_calibration, with_scal
 from sfm_calib.partial import completed
 from sfm_calib.prior import prior_of, started, with_lenses
 from sfm_calib.recalibration_record import OldFile, Recalibration
-from sfm_calib.restated import restated
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
 
@@ -87,19 +87,13 @@ class Solved:
     covariance: CalibrationCovariance
     split: SplitCheck | None
     prior: PriorRig
-    follows: Sensitivity | None  # None: nothing of the old calibration is held, or believed
-
-    @property
-    def stated(self) -> Covariance:
-        """What was held counts as uncertain as it was."""
-        alone = self.covariance.stated
-        return considered(alone, self.follows) if self.follows else alone
+    cov_change: Covariance | None  # of it less the old calibration; None: they are independent
 
     @property
     def side(self) -> Stated:
         """In the result's unit, for the maths."""
         unit = 1 / self.covariance.basis.unit
-        return Stated(self.refinement.estimate.scaled(unit), self.stated)
+        return Stated(self.refinement.estimate.scaled(unit), self.covariance.stated)
 
 
 def recalibrate(
@@ -114,7 +108,8 @@ def recalibrate(
 ) -> Recalibrated:
     """Test an old calibration by a scan, and calibrate its rig anew.
 
-    drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the two have no camera in common.
+    drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the
+    two have no camera in common.
     """
     watch = Stopwatch()
     if options.metres is not None:
@@ -149,7 +144,6 @@ def recalibrate(
         ),
         drift=found.record,
     )
-    calibration = restated(calibration, best.stated)
     whole = completed(calibration, old.rig, record, _unmoved(found.record))
     return Recalibrated(Outcome(whole, best.refinement, unit), found.record)
 
@@ -182,27 +176,25 @@ def _solve(
     with watch.stage(f"solving ({mode})"):
         refinement = solve_problem(problem, config, progress)
     with watch.stage(f"covariance ({mode})"):
-        covariance, split = covariance_of(refinement, config, progress)
-        follows = None
-        if prior.held or mode == "full":
-            with refusals():
-                follows = sensitivity(
-                    refinement.graph, refinement.estimate, refinement.values, covariance.basis
-                )
-    return Solved(refinement, covariance, split, prior, follows)
+        covariance, split = own_covariance_of(refinement, config, progress)
+        if not prior.held and mode != "full":
+            return Solved(refinement, covariance, split, prior, None)
+        with refusals():
+            how = sensitivity(
+                refinement.graph, refinement.estimate, refinement.values, covariance.basis
+            )
+        cov_change = cov_difference(covariance.stated, how)
+        return Solved(refinement, with_old_errors(covariance, how), split, prior, cov_change)
 
 
 def _drift(old: OldCalibration, new: Solved, options: DriftOptions, scale_free: bool) -> Judged:
     """Of the cameras that both have."""
     names = old.common([camera.name for camera in new.refinement.estimate.cameras])
-    before = _part(old.own if new.follows is None else old.stated, names)
+    before = _part(old.own if new.cov_change is None else old.stated, names)
     after = _part(new.side, names)
-    apart = None
-    if new.follows is not None:
-        apart = cov_difference(new.covariance.stated, new.follows)
     return judge(
         before, after, old.unit or "m", options,
-        scale_free=scale_free, tested=set(_tested(before, new.prior.held)), cov_difference=apart,
+        scale_free=scale_free, tested=set(_tested(before, new.prior.held)), cov_difference=new.cov_change,
         notes=old.notes,
     )  # fmt: skip
 

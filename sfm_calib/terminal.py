@@ -23,10 +23,11 @@ from rich.table import Table
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.images import Progress as Report
-from sfm_calib.report import TruthRow
 from sfm_calib.report.board import board_lines, gains
 from sfm_calib.report.checks import checks_of
+from sfm_calib.report.digits import sigma_text, with_digits
 from sfm_calib.report.lens_ladder import rung_label
+from sfm_calib.report.rows import TruthRow
 from sfm_calib.report.weak import Mark, marks_of
 from sfm_calib.result import PRIOR_DECIDES_SHARE, Calibration
 
@@ -304,26 +305,3 @@ def print_comparison(rows: Sequence[TruthRow], console: Console) -> None:
             style="bold red" if abs(row.z) > SUSPICIOUS_Z else "",
         )
     console.print(table)
-
-
-def with_digits(value: float, sigma: float, sign: str = "") -> str:
-    """A value to the second digit of its sigma, which is as far as it means something."""
-    decimals = _decimals(sigma)
-    if decimals is None:
-        return f"{value:{sign}.6g}"
-    text = f"{value:{sign}.{decimals}f}"
-    return text if float(text) or value >= 0 else text.replace("-", "+" if sign else "", 1)
-
-
-def sigma_text(sigma: float) -> str:
-    """A sigma to two digits, aligned with its value."""
-    decimals = _decimals(sigma)
-    return "fixed" if decimals is None else f"{sigma:.{decimals}f}"
-
-
-def _decimals(sigma: float) -> int | None:
-    """Decimals that show two digits of a sigma, or None where there is no sigma."""
-    if not (math.isfinite(sigma) and sigma > 0):
-        return None
-    exponent = int(f"{sigma:.1e}".split("e")[1])  # after rounding: 0.0996 is 1.0e-01
-    return max(0, 1 - exponent)

@@ -297,7 +297,7 @@ def test_nerf_files_that_cannot_be(tmp_path: Path) -> None:
     assert "none that a lens here is" in said(camera_model="EQUIRECTANGULAR", frames=frames(1))
     assert "one file_path" in said(frames=frames(1, cx=1) * 2)
     assert "last 0 0 0 1" in said(frames=[{"cx": 1, "transform_matrix": np.ones((4, 4)).tolist()}])
-    assert "no size" in said(w=640.5, frames=frames(1))
+    assert "whole number" in said(w=640.5, frames=frames(1))
     assert "fl_x, w and h" in refused(
         written(tmp_path / "t.json", json.dumps({"camera_angle_x": 0.7, "frames": frames(2)}))
     )
@@ -359,7 +359,7 @@ def test_what_is_left_out_is_told(format: Format) -> None:
         unit="baseline", covariance=Covariance(("left.fx",), np.eye(1)),
     )  # fmt: skip
     notes = " ".join(format.write(rig).notes)
-    assert "covariances: they are left out" in notes and "longest baseline, not metres" in notes
+    assert "covariance are not held" in notes and "longest baseline, not metres" in notes
     alone = rig_of((camera_of("radtan"),), PLACES[:1])
     assert "length" not in " ".join(format.write(replace(alone, cam_from_rig=None)).notes)
     with pytest.raises(CalibrationError, match="does not say how its 3 cameras sit"):

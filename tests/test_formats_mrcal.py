@@ -141,7 +141,7 @@ def test_models_that_are_not_whole(tmp_path: Path) -> None:
         ("'extrinsics'", "'else'", "extrinsics"),
         ("501.5", "-1", "both must be positive"),
         ("501.5", "1e999", "not finite"),
-        ("640, 480", "640.5, 480", "no size of an image"),
+        ("640, 480", "640.5, 480", "whole number"),
         ("-2e-3,", "", "has 7 numbers, not 8"),
         ("500,", "1j,", "something else than numbers"),
         ("500,", "9" * 400 + ",", "something else than numbers"),

@@ -14,7 +14,7 @@ from test_report import scene
 from test_result import rig
 
 from graphs.scale_ledger import LedgerEntry, ScaleLedger
-from sfm_calib.report import write_report
+from sfm_calib.report.page import write_report
 from sfm_calib.report.scale_ledger import ledger_section
 from sfm_calib.result import Calibration, Scale, load_calibration, save_calibration
 from sfm_calib.scale_ledger import COMPROMISE, contradiction, entries_of

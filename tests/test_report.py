@@ -15,11 +15,11 @@ from graphs.frames import Transform
 from graphs.problem import Estimate, Observations, Problem, points_in_cameras, residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.provenance import Provenance
-from sfm_calib.report import TruthRow, write_report
 from sfm_calib.report.correlation import correlation_matrix, strongest_pairs
 from sfm_calib.report.image_plane import cell_counts, cell_means, noise_of_cell_mean
+from sfm_calib.report.page import write_report
 from sfm_calib.report.residuals import radial_profile, residuals_by_camera
-from sfm_calib.report.rows import baseline_sigma, camera_tables, quantity, rig_tables
+from sfm_calib.report.rows import TruthRow, baseline_sigma, camera_tables, quantity, rig_tables
 from sfm_calib.report.scene import central, frustum
 from sfm_calib.report.theme import evenly, round_number
 from sfm_calib.result import (

@@ -7,9 +7,8 @@ say how the others sit. Pixels are counted from the corner of the first.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from graphs.camera import Camera
 from graphs.frames import Transform
@@ -33,12 +32,9 @@ EMPTY = {
 
 def write_colmap(rig: CameraRig) -> Export:
     """cameras.txt, rigs.txt, rig_config.json, and files of images and points with none in them."""
-    placed = list(places(rig))
-    reference = next((i for i, t in enumerate(placed) if _is_identity(t)), 0)
-    moved = not _is_identity(placed[reference])
-    if moved:
-        placed = [t @ placed[0].inverse for t in placed]
-        placed[0] = Transform.identity()
+    own = replace(rig, cam_from_rig=places(rig))
+    rig, reference = own.referenced()
+    placed = places(rig)
     models = [_model(camera) for camera in rig.cameras]
     files = {
         "cameras.txt": _cameras_text(rig.cameras, models),
@@ -47,13 +43,9 @@ def write_colmap(rig: CameraRig) -> Export:
         rig_config.NAME: _config_text(rig.cameras, models, placed, reference),
     }
     notes = unheld(rig, "COLMAP")
-    if moved and len(placed) > 1:
+    if rig is not own and len(placed) > 1:
         notes += (f"the rig's frame is that of {rig.names[0]} now: COLMAP wants a camera's",)
     return Export({name: text.encode() for name, text in files.items()}, notes)
-
-
-def _is_identity(t: Transform) -> bool:
-    return np.array_equal(t.rotation, np.eye(3)) and not t.translation.any()
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
@@ -73,7 +65,7 @@ def _cameras_text(cameras: tuple[Camera, ...], models: list[tuple[str, list[floa
     return "\n".join(rows) + "\n"
 
 
-def _rig_text(placed: list[Transform], reference: int) -> str:
+def _rig_text(placed: tuple[Transform, ...], reference: int) -> str:
     words: list[object] = [1, len(placed), "CAMERA", reference + 1]
     for index, place in enumerate(placed):
         if index != reference:
@@ -92,7 +84,7 @@ def _row(*words: object) -> str:
 def _config_text(
     cameras: tuple[Camera, ...],
     models: list[tuple[str, list[float]]],
-    placed: list[Transform],
+    placed: tuple[Transform, ...],
     reference: int,
 ) -> str:
     entries = []

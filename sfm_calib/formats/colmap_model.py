@@ -16,9 +16,8 @@ from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.colmap_lenses import LENS_OF_MODEL, out_of_model
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.bounded import bounded_bytes
-from sfm_calib.formats.numbers import image_size, numbers
-from sfm_calib.formats.reading import CameraRig
+from sfm_calib.formats.numbers import numbers
+from sfm_calib.formats.reading import CameraRig, image_size
 
 FORMAT = "COLMAP model"
 PIXEL_OFFSET = 0.5
@@ -123,7 +122,7 @@ def _placed(q_and_t: Sequence[float]) -> Transform:
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
-    for line in bounded_bytes(path).decode("utf-8").splitlines():
+    for line in path.read_text("utf-8").splitlines():
         if line.strip() and not line.startswith("#"):
             yield line.split()
 
@@ -164,7 +163,7 @@ class _Bytes:
     """Reads numbers one after the other."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = bounded_bytes(path), 0
+        self.data, self.at = path.read_bytes(), 0
 
     def take(self, kinds: str) -> tuple[float, ...]:
         found: tuple[float, ...] = struct.unpack_from(f"<{kinds}", self.data, self.at)

@@ -8,6 +8,7 @@ from urllib.parse import quote, unquote
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats.reading import CameraRig
+from sfm_calib.formats.writing import of_sigmas
 
 LONGEST_NAME = 200  # bytes of a file's name without its suffix; file systems hold 255
 UNITS = {
@@ -34,12 +35,10 @@ def places(rig: CameraRig) -> tuple[Transform, ...]:
 
 def unheld(rig: CameraRig, format_name: str) -> tuple[str, ...]:
     """What every format here leaves out: sigmas, and the unit of length."""
-    notes = []
-    if rig.states_sigmas:
-        notes.append(f"{format_name} holds no sigmas or covariances: they are left out")
+    notes = of_sigmas(rig)
     if len(rig.cameras) > 1:
-        notes.append(f"{format_name} does not say its unit of length: here {UNITS[rig.unit]}")
-    return tuple(notes)
+        notes += (f"{format_name} does not say its unit of length: here {UNITS[rig.unit]}",)
+    return notes
 
 
 def file_name(name: str) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.bounded import bounded_bytes
 from sfm_calib.formats.caliscope import cameras_in, read_caliscope
 from sfm_calib.formats.file_storage import EXTRINSICS, INTRINSICS, read_file_storage
 from sfm_calib.formats.kalibr import read_kalibr
@@ -73,7 +72,8 @@ def _read(path: Path) -> CameraRig:
     except UnicodeDecodeError as error:
         raise CalibrationError(_unknown(path)) from error
     start = text.lstrip()
-    if not start.startswith("{") and len(text) > MOST_BYTES_OF_OTHERS:
+    long = start.startswith("{") or looks_like_mrcal(start)
+    if not long and len(text) > MOST_BYTES_OF_OTHERS:
         raise CalibrationError(_unknown(path))
     return _text(path, text, start)
 
@@ -98,7 +98,7 @@ def _folder(folder: Path) -> CameraRig:
         if (folder / name).is_file():
             return read_calibration(folder / name)
     if models := sorted(p for p in folder.iterdir() if p.suffix == SUFFIX):
-        return read_mrcal_files({p: bounded_bytes(p).decode("utf-8", "replace") for p in models})
+        return read_mrcal_files({path: text_of(path, MOST_BYTES) for path in models})
     found = sorted(p for p in folder.iterdir() if p.suffix in YAML_SUFFIXES)
     for path in found:
         if path.stem in (INTRINSICS, EXTRINSICS):

@@ -22,8 +22,8 @@ from graphs.frames import Transform, log_rotation
 from graphs.lenses import LensName
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats.contents import camera_name, file_name, places, unheld
-from sfm_calib.formats.numbers import image_size, numbers
-from sfm_calib.formats.reading import CameraRig, opencv_camera, transform
+from sfm_calib.formats.numbers import numbers
+from sfm_calib.formats.reading import CameraRig, image_size, opencv_camera, transform
 from sfm_calib.formats.writing import Export, Format
 
 FORMAT = "mrcal cameramodel"

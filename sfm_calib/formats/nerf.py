@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from graphs.lenses import PARAMETER_NAMES, LensName
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats.colmap_model import PIXEL_OFFSET
 from sfm_calib.formats.contents import camera_name, file_path, places, unheld
-from sfm_calib.formats.numbers import image_size, number, numbers
-from sfm_calib.formats.reading import CameraRig, transform
+from sfm_calib.formats.numbers import number, numbers
+from sfm_calib.formats.reading import CameraRig, image_size, transform
 from sfm_calib.formats.writing import Export, Format
 
 FORMAT = "NeRF transforms.json"
@@ -37,7 +37,7 @@ OWN = ("fl_x", "fl_y", "cx", "cy", "k1")  # of a frame with a lens of its own
 NAMES = {"fx": "fl_x", "fy": "fl_y"}
 
 
-def looks_like_nerf(content: object) -> bool:
+def looks_like_nerf(content: object) -> TypeGuard[Mapping[str, Any]]:
     """Whether it has frames, and a focal length at the top or in the first."""
     frames = content.get("frames") if isinstance(content, Mapping) else None
     return isinstance(frames, list) and any(

@@ -6,9 +6,7 @@ import numpy as np
 
 from graphs.frames import FloatArray
 from sfm_calib.errors import CalibrationError
-
-LARGEST = 1e9  # of any number of a calibration: what is made of it stays finite
-LARGEST_SIDE_PX = 100_000
+from sfm_calib.formats.reading import MOST_NUMBER
 
 
 def numbers(what: str, entry: object, *shape: int) -> FloatArray:
@@ -25,19 +23,11 @@ def numbers(what: str, entry: object, *shape: int) -> FloatArray:
         n >= 0 and n != m for n, m in zip(shape, found.shape, strict=True)
     ):
         raise CalibrationError(f"{what} has {found.size} numbers, not {wanted}")
-    if not (np.abs(found) <= LARGEST).all():  # nor where it is NaN
-        raise CalibrationError(f"{what} holds numbers that are not finite, or beyond {LARGEST:.0e}")
+    if not (np.abs(found) < MOST_NUMBER).all():  # nor where it is NaN
+        raise CalibrationError(f"{what} holds numbers beyond {MOST_NUMBER:.0e}, or not finite")
     return found
 
 
 def number(what: str, entry: object) -> float:
     """One finite number. Raises CalibrationError."""
     return float(numbers(what, entry))
-
-
-def image_size(what: str, width: object, height: object) -> tuple[int, int]:
-    """Width and height in px. Raises CalibrationError where they are none."""
-    sides = numbers(what, [width, height], 2)
-    if (sides != np.floor(sides)).any() or not ((sides > 0) & (sides <= LARGEST_SIDE_PX)).all():
-        raise CalibrationError(f"{what} is no size of an image: {sides[0]:g} x {sides[1]:g} px")
-    return int(sides[0]), int(sides[1])

@@ -5,7 +5,6 @@ What `colmap rig_configurator` reads (src/colmap/scene/rig.cc): quaternions wxyz
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,11 @@ import numpy as np
 from graphs.camera import Camera
 from graphs.frames import Transform
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.bounded import bounded_bytes
 from sfm_calib.formats.colmap_model import model_camera, read_colmap
 from sfm_calib.formats.contents import LONGEST_NAME
 from sfm_calib.formats.numbers import numbers
 from sfm_calib.formats.reading import NO_SIZE, CameraRig
+from sfm_calib.formats.trees import json_tree, text_of
 
 FORMAT = "COLMAP rig_config.json"
 NAME = "rig_config.json"
@@ -100,9 +99,9 @@ def read_colmap_folder(folder: Path) -> CameraRig:
     if not path.is_file():
         return rig
     try:
-        content = json.loads(bounded_bytes(path))
+        content = json_tree(path, text_of(path))
         stated = read_rig_config(path, content) if looks_like_rig_config(content) else None
-    except (CalibrationError, ValueError, RecursionError):
+    except (CalibrationError, ValueError):
         stated = None
     if stated is None or not _same(stated.cameras, rig.cameras):
         note = f"{path} is of other lenses: the cameras are called by their numbers"

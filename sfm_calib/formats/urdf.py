@@ -16,7 +16,7 @@ from graphs.frames import FloatArray, Transform
 from graphs.lenses import LENS_NAMES
 from sfm_calib.formats.contents import UNITS, places
 from sfm_calib.formats.reading import CameraRig
-from sfm_calib.formats.writing import Export, Format
+from sfm_calib.formats.writing import Export, Format, of_sigmas
 
 FORMAT = "URDF and static transforms"
 RIG = "camera_rig"
@@ -63,7 +63,7 @@ def _renamed(names: tuple[str, ...], frames: list[str]) -> list[str]:
 
 
 def _left_out(rig: CameraRig) -> list[str]:
-    notes = [f"{FORMAT} hold no lenses, image sizes, sigmas or covariances: they are left out"]
+    notes = [f"{FORMAT} hold no lenses and image sizes: they are left out", *of_sigmas(rig)]
     if rig.unit != "m" and len(rig.cameras) > 1:
         notes.append(f"ROS takes lengths as metres, but those of {rig.path} are {UNITS[rig.unit]}")
     return notes

@@ -14,10 +14,10 @@ from plotly.offline import get_plotlyjs
 
 from graphs.compare import Difference
 from sfm_calib.compare_record import Comparison, Kind, PairDifference, ParameterDifference
-from sfm_calib.compare_terminal import at_range, signed_percent, taken_out
+from sfm_calib.compare_terminal import taken_out
 from sfm_calib.compare_verdict import p_text, px_text
 from sfm_calib.files import write_atomically
-from sfm_calib.report.digits import decimals_for, number, short
+from sfm_calib.report.digits import at_range, decimals_for, number, short, signed_percent
 from sfm_calib.report.image_plane import add_arrows, in_image
 from sfm_calib.report.theme import (
     AMBER,

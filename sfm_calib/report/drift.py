@@ -6,12 +6,10 @@ import plotly.graph_objects as go
 from markupsafe import Markup
 
 from graphs.drift import Verdict
-from sfm_calib.compare_terminal import at_range
 from sfm_calib.drift_record import DriftRecord, DriftTest
-from sfm_calib.drift_terminal import change_of
-from sfm_calib.drift_verdict import p_text, who
+from sfm_calib.drift_verdict import change_of, p_text, who
 from sfm_calib.report.comparison import depth_figure, has_depth
-from sfm_calib.report.digits import short
+from sfm_calib.report.digits import at_range, short
 from sfm_calib.report.theme import (
     AMBER,
     BLUE,
