@@ -84,15 +84,16 @@ def _positive(flag: str, value: float) -> float:
 
 
 def _write(command: Convert, export: Export) -> None:
-    out, is_file = command.out, set(export.files) == {""}
+    out, files = command.out, export.files
+    is_file = len(files) == 1 and Path(*files).suffix in ("", out.suffix)  # or a folder with one
     empty = out.is_dir() and not any(out.iterdir())
     if is_file and out.is_dir():
         raise CalibrationError(f"{out} is a folder: name a file in it")
     if not is_file and out.exists() and not out.is_dir():
-        raise CalibrationError(f"{out} is a file, and {len(export.files)} go into a folder")
+        raise CalibrationError(f"{out} is a file, and what is written goes into a folder")
     if os.path.lexists(out) and not command.overwrite and not empty:
         raise CalibrationError(f"{out} is there already: choose another name, or --overwrite")
     if is_file:
-        write_atomically(out, export.files[""])
+        write_atomically(out, *files.values())
     else:
-        write_folder_atomically(out, export.files)
+        write_folder_atomically(out, files)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic.calibrations import apart_px, rig_of, there
+from synthetic.calibrations import READ_BACK, apart_px, rig_of, there
 from synthetic.scans import DATA
 
 from graphs.covariance import Covariance
@@ -26,7 +26,7 @@ from sfm_calib.formats.convert import (
 from sfm_calib.formats.writing import Export
 
 EXACT_PX = 1e-6
-DIFFERENT = [name for name in FORMATS if name not in ("opencv_xml", "opencv_json")]  # in lenses
+DIFFERENT = [name for name in READ_BACK if name not in ("opencv_xml", "opencv_json")]  # in lenses
 REAL = (
     "fisheye_rig5/kalibr/calib_3_cam0-1-camchain-imucam.yaml",
     "fisheye_rig5/kalibr/calib_3_cam2-camchain-imucam.yaml",
@@ -38,7 +38,7 @@ REAL = (
 
 
 def holding(*counts: str) -> list[FormatName]:
-    return [name for name, form in FORMATS.items() if form.cameras in counts]
+    return [name for name in READ_BACK if FORMATS[name].cameras in counts]
 
 
 def refusal(rig: CameraRig, to: FormatName, max_error_px: float = MOST_ERROR_PX) -> str:
@@ -77,7 +77,8 @@ def test_three_cameras_go_everywhere_and_come_back(
 def test_a_pair_goes_everywhere_and_comes_back(
     a: FormatName, b: FormatName, lens: LensName, tmp_path: Path
 ) -> None:
-    if not all({lens, "brown"} & set(FORMATS[name].lenses) for name in (a, b)):
+    held = {lens, "brown"} if lens == "radtan" else {lens}
+    if not all(held & set(FORMATS[name].lenses) for name in (a, b)):
         pytest.skip(f"no {lens} in {a} or {b}")
     made = rig_of(lens, lens, names=("left", "right"))
     first = there(made, a, tmp_path / "1")
@@ -161,7 +162,7 @@ def with_sigmas(rig: CameraRig) -> CameraRig:
     return replace(rig, covariance=Covariance(names, root @ root.T))
 
 
-@pytest.mark.parametrize("to", [name for name in FORMATS if name != "sfm_calib"])
+@pytest.mark.parametrize("to", [name for name in READ_BACK if name != "sfm_calib"])
 def test_sigmas_are_not_dropped_in_silence(to: FormatName) -> None:
     if FORMATS[to].cameras == "one":
         pytest.skip("one camera")
@@ -231,5 +232,5 @@ def test_the_name_tells_the_format() -> None:
     assert format_of(Path("x.XML"), None) == "opencv_xml"
     assert format_of(Path("x.json"), "opencv") == "opencv_json"
     assert format_of(Path("x.json"), "sfm_calib") == "sfm_calib"
-    with pytest.raises(CalibrationError, match="say --to kalibr, opencv"):
+    with pytest.raises(CalibrationError, match=r"say --to .*kalibr.*opencv"):
         format_of(Path("x.yaml"), None)

@@ -68,6 +68,15 @@ def test_some_cameras_go_into_a_folder(ours: Path, tmp_path: Path) -> None:
     assert read_calibration(out).names == ("right", "left")
 
 
+def test_one_camera_of_a_format_with_folders_is_a_file_where_out_is(
+    ours: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "left.cameramodel"
+    assert convert(ours, out, "--camera", "left") == 0 and out.is_file()
+    assert convert(ours, tmp_path / "models", "--to", "mrcal", "--camera", "left") == 0
+    assert in_folder(tmp_path / "models").keys() == {"left.cameramodel"}
+
+
 def test_nothing_is_overwritten_unless_told(
     ours: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,7 +94,7 @@ def test_nothing_is_overwritten_unless_told(
     assert "is there already" in error_of(capsys, ours, folder, "--to", "ros")
     assert "other files too" in error_of(capsys, ours, folder, "--to", "ros", "--overwrite")
     assert "is a folder" in error_of(capsys, ours, folder, "--to", "opencv", "--overwrite")
-    assert "go into a folder" in error_of(capsys, ours, ours, "--to", "ros", "--overwrite")
+    assert "goes into a folder" in error_of(capsys, ours, ours, "--to", "ros", "--overwrite")
     assert in_folder(folder) == {"one.jpg": b""}
 
 
@@ -115,7 +124,7 @@ def test_what_is_missing_can_be_said(tmp_path: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["x.yaml"], "say --to kalibr"),
+        (["x.yaml"], "say --to"),
         (["x.xml", "--camera", "lefd"], "did you mean 'left'?"),
         (["x.xml", "--camera", "left", "left"], "twice"),
         (["x.xml", "--metres", "-1"], "--metres -1 must be above 0"),

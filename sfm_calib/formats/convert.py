@@ -46,6 +46,7 @@ GUESSES: tuple[tuple[str, FormatName], ...] = (
     ("*camchain*.yaml", "kalibr"),
     ("*camchain*.yml", "kalibr"),
     ("*.xml", "opencv_xml"),
+    ("*.cameramodel", "mrcal"),
     ("*transforms*.json", "nerf"),
 )
 BY_SUFFIX: dict[tuple[FormatName, str], FormatName] = {

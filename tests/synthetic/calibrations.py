@@ -12,11 +12,12 @@ from graphs.camera import image_pixels, project, unproject
 from graphs.frames import Transform
 from graphs.lenses import LensName
 from sfm_calib.formats import CameraRig, read_calibration
-from sfm_calib.formats.convert import FormatName, exported
+from sfm_calib.formats.convert import FORMATS, FormatName, exported
 from sfm_calib.formats.reading import LengthUnit
 from sfm_calib.formats.writing import Export
 from synthetic.cameras import COEFFICIENTS, camera_of
 
+READ_BACK = [name for name in FORMATS if name != "urdf"]  # which is written alone
 # What a folder, or another program, may call a camera.
 NAMES = st.text(
     st.characters(blacklist_categories=["C", "Z"]) | st.sampled_from(" ,'\"\\:#&<>{}[]%-~"),
@@ -66,8 +67,10 @@ def put(export: Export, out: Path) -> Path:
 
 
 def there(rig: CameraRig, to: FormatName, out: Path, max_error_px: float = 1e-6) -> CameraRig:
-    """A calibration written in a format, and read again."""
-    return read_calibration(put(exported(rig, to, max_error_px), out))
+    """A calibration in metres written in a format, and read again."""
+    back = read_calibration(put(exported(rig, to, max_error_px), out))
+    # mrcal, COLMAP and NeRF do not say what they count in, as one says with --metres 1.
+    return back.metric(1.0) if rig.unit == "m" and back.unit == "unknown" else back
 
 
 def apart_px(a: CameraRig, b: CameraRig) -> float:
