@@ -15,6 +15,7 @@ from sfm_calib.files import write_atomically
 from sfm_calib.provenance import Provenance
 from sfm_calib.report.board import board_section
 from sfm_calib.report.checks import checks_of
+from sfm_calib.report.contributions import contribution_section
 from sfm_calib.report.correlation import correlation_figure, strongest_pairs, z_figure
 from sfm_calib.report.drift import drift_section
 from sfm_calib.report.headline import banner, key_figures, truth_summary
@@ -117,6 +118,7 @@ def render(
         board=board_section(calibration, problem, estimate),
         scale_ledger=ledger_section(calibration),
         drift=drift_section(drift) if drift else "",
+        contributions=contribution_section(calibration.recalibration, calibration.rig.metric),
         other_rows=rows_without_table((*lenses, *rig), truth_rows),
         has_truth=bool(truth_rows),
         truth_summary=truth_summary(truth_rows),
