@@ -185,7 +185,7 @@ def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
             board, command.board_images,
         )  # fmt: skip
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
-        finish(outcome, command.out, rows, command.json)
+        finish(outcome, command.out, rows, command.json, command.export)
 
 
 def run_target(command: Target, arguments: Sequence[str]) -> None:
@@ -205,7 +205,7 @@ def run_target(command: Target, arguments: Sequence[str]) -> None:
                 command.images, board, again.options, config, cache, progress, told(arguments)
             )
         rows = compare_with_truth(outcome.calibration, truth) if truth else []
-        finish(outcome, command.out, rows, command.json)
+        finish(outcome, command.out, rows, command.json, command.export)
 
 
 def run_board(command: BoardCommand) -> None:

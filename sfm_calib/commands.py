@@ -12,6 +12,7 @@ from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.convert_command import Convert
+from sfm_calib.formats.convert import FormatName
 from sfm_calib.history_command import HistoryCommand
 from sfm_calib.recalibrate_command import Recalibrate
 from sfm_calib.simulate.scan import SimulateOptions
@@ -42,6 +43,8 @@ class Calibrate:
     """Images of the board by the same cameras, in folders as the scan's."""
     truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A truth.json to compare with, as `simulate` writes it."""
+    export: Annotated[tuple[FormatName, ...], tyro.conf.arg(metavar="FORMAT")] = ()
+    """Formats of other programs to write into OUT/exports as well, as `convert` does."""
     fresh: bool = False
     """Ignore what earlier runs left in OUT/cache."""
     json: bool = False
@@ -66,6 +69,8 @@ class Target:
     options: Annotated[TargetOptions, tyro.conf.arg(name="")] = field(default_factory=TargetOptions)
     truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A truth.json to compare with."""
+    export: Annotated[tuple[FormatName, ...], tyro.conf.arg(metavar="FORMAT")] = ()
+    """Formats of other programs to write into OUT/exports as well, as `convert` does."""
     fresh: bool = False
     """Ignore what earlier runs left in OUT/cache."""
     json: bool = False

@@ -13,11 +13,13 @@ from pathlib import Path
 
 from sfm_calib.calibrate import Outcome
 from sfm_calib.errors import CalibrationError
+from sfm_calib.exports import write_exports
+from sfm_calib.formats.convert import FormatName
 from sfm_calib.provenance import now
 from sfm_calib.report.page import write_report
 from sfm_calib.report.rows import TruthRow
 from sfm_calib.result import save_calibration
-from sfm_calib.terminal import print_comparison, print_result, result_console
+from sfm_calib.terminal import print_comparison, print_line, print_result, result_console
 
 LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 
@@ -53,20 +55,34 @@ def output_folder(out: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def finish(outcome: Outcome, out: Path, rows: Sequence[TruthRow], as_json: bool) -> None:
-    """Write calibration.json and report.html, both or none, and print the result."""
+def finish(
+    outcome: Outcome,
+    out: Path,
+    rows: Sequence[TruthRow],
+    as_json: bool,
+    formats: Sequence[FormatName] = (),
+) -> None:
+    """Write calibration.json and report.html, both or none, then exports; print the result.
+
+    Raises CalibrationError at the end, where a format refused.
+    """
     provenance = outcome.calibration.provenance.model_copy(update={"created": now()})
     calibration = outcome.calibration.model_copy(update={"provenance": provenance})
     outcome = replace(outcome, calibration=calibration)
     write_results(outcome, out, rows)
+    console = result_console()
     if as_json:
         print(calibration.model_dump_json(indent=1))
-        return
-    console = result_console()
-    print_result(calibration, console)
-    if rows:
-        print_comparison(rows, console)
-    console.print(f"{out / 'calibration.json'} and {out / 'report.html'} written", soft_wrap=True)
+    else:
+        print_result(calibration, console)
+        if rows:
+            print_comparison(rows, console)
+        print_line(console, f"{out / 'calibration.json'} and {out / 'report.html'} written")
+    written, refused = write_exports(calibration, formats, out)
+    for line in () if as_json else written:
+        print_line(console, line)
+    if refused:
+        raise CalibrationError("; ".join(refused) + f" ({out / 'calibration.json'} is written)")
 
 
 def write_results(outcome: Outcome, out: Path, rows: Sequence[TruthRow]) -> None:

@@ -17,6 +17,7 @@ from sfm_calib.drift import EXIT_STATUS, DriftOptions
 from sfm_calib.drift_terminal import print_drift
 from sfm_calib.files import refuse_overwrite
 from sfm_calib.formats import read_calibration
+from sfm_calib.formats.convert import FormatName
 from sfm_calib.images import camera_names
 from sfm_calib.output import finish, output_folder, told
 from sfm_calib.recalibrate import RecalibrateOptions, recalibrate
@@ -47,6 +48,8 @@ class Recalibrate:
     """Exit with the verdict: 0 keep, 3 replace, 4 inconclusive (2 is bad input)."""
     truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A truth.json to compare with, as `simulate` writes it."""
+    export: Annotated[tuple[FormatName, ...], tyro.conf.arg(metavar="FORMAT")] = ()
+    """Formats of other programs to write into OUT/exports as well, as `convert` does."""
     overwrite: bool = False
     """Let OUT replace OLD, where they are in one place."""
     fresh: bool = False
@@ -78,5 +81,5 @@ def run_recalibrate(command: Recalibrate, config: RigConfig, arguments: Sequence
         if not command.json:
             print_drift(done.drift, result_console())
         rows = compare_with_truth(done.outcome.calibration, truth) if truth else []
-        finish(done.outcome, command.out, rows, command.json)
+        finish(done.outcome, command.out, rows, command.json, command.export)
     return EXIT_STATUS[done.drift.verdict] if command.exit_code else 0
