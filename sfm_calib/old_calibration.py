@@ -16,6 +16,8 @@ from sfm_calib.drift import EXACT, DriftOptions
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import CameraRig
 from sfm_calib.images import Scan
+from sfm_calib.lifted import lifted
+from sfm_calib.nominal import LONE_LENS, RIG_LENS
 from sfm_calib.partial import reference_of, stated_of
 from sfm_calib.prior import checked
 from sfm_calib.uncertainty import Unit
@@ -86,6 +88,8 @@ def old_calibration(
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
     rig, unit = _in_unit(rig)
+    least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
+    rig, told = lifted(rig, least, options.old_sigma_px, options.range(unit or "m"))
     assumed = not rig.states_sigmas
     if assumed:
         side = stated_of(rig)
@@ -94,7 +98,7 @@ def old_calibration(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
         rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
-    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes))
+    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *told))
 
 
 def _named_as(
