@@ -46,7 +46,9 @@ def first_pairs(scan: Scan, overlapping: np.ndarray) -> list[Pair]:
     pairs = set()
     for (camera, frame), number in place.items():
         for other in range(len(scan.cameras)):
-            steps = OWN_STEPS if other == camera else OTHER_STEPS if overlapping[camera, other] else ()
+            steps = (
+                OWN_STEPS if other == camera else OTHER_STEPS if overlapping[camera, other] else ()
+            )
             for step in steps:
                 neighbour = place.get((other, frame + step))
                 if neighbour is not None and neighbour != number:
