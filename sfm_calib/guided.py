@@ -19,7 +19,7 @@ from graphs.build import GraphOptions
 from graphs.camera import Camera
 from graphs.frames import Transform
 from graphs.lenses import LensName
-from graphs.problem import Problem
+from graphs.problem import Problem, images_seen
 from graphs.refine import refine
 from sfm_calib import colmap, features
 from sfm_calib.cache import Cache
@@ -31,10 +31,12 @@ from sfm_calib.formats.reading import CameraRig
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping import (
     DATABASE,
+    ENOUGH_REGISTERED,
     MIN_MATCHES,
     Mapped,
     check_overlap,
     map_matched,
+    map_scan,
     problem_of,
     reference_of,
 )
@@ -83,9 +85,34 @@ def map_with_prior(
     )
     found = features.load(place)
     scales = {i.path: f.scales for i, f in zip(scan.images, found, strict=True)}
-    coarse, messages = problem_of(scan, config, lenses, models, models / DATABASE, scales)
-    coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
+    try:
+        coarse, messages = problem_of(scan, config, lenses, models, models / DATABASE, scales)
+        _check_placed(coarse, scan)
+        coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
+    except CalibrationError as error:
+        return _without_old(scan, config, lenses, known, cache, progress, str(error))
     return Mapped(fine_problem(scan, coarse, found, progress), messages, hashes)
+
+
+def _check_placed(coarse: Problem, scan: Scan) -> None:
+    placed, n = len(images_seen(coarse.observations)), len(scan.images)
+    if placed < ENOUGH_REGISTERED * n:
+        raise CalibrationError(f"only {placed} of {n} images could be placed")
+
+
+def _without_old(
+    scan: Scan,
+    config: RigConfig,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    cache: Cache,
+    progress: Progress,
+    why: str,
+) -> Mapped:
+    """The scan mapped in full, of old the lenses alone for a start; and why."""
+    mapped = map_scan(scan, config, lenses, known, cache, progress)
+    said = f"the scan was mapped without the old calibration's help: with it, {why}"
+    return replace(mapped, messages=(said, *mapped.messages))
 
 
 def _nominal(scan: Scan, old: CameraRig, reference: int) -> dict[int, Transform]:

@@ -92,8 +92,8 @@ def _match(
 ) -> Any:  # fmt: skip
     """The feature of b (n_a,) that matches each of a, -1: none, and how like it is.
 
-    `rays_a` are turned into b's frame. A point at any depth before a is seen by b between its ray's direction, at infinity, and a's
-    place.
+    `rays_a` are turned into b's frame. A point at any depth before a is seen by b between its
+    ray's direction, at infinity, and a's place.
     """
     n_a, n_b = len(rays_a), len(rays_b)
     best_a, second_a = np.full(n_a, np.float32(-1)), np.full(n_a, np.float32(-1))
