@@ -22,13 +22,7 @@ from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from graphs.problem import Observations
 from graphs.rig_start import FreeModel
-from sfm_calib.colmap_lenses import (
-    LENS_OF_MODEL,
-    MAPPING_MODEL,
-    fisheye_guess,
-    in_model,
-    out_of_model,
-)
+from sfm_calib.colmap_lenses import MAPPING_MODEL, fisheye_guess, in_model, out_of_model
 from sfm_calib.errors import CalibrationError
 from sfm_calib.features import Features
 from sfm_calib.images import Progress, Scan
@@ -116,9 +110,8 @@ def extract_features(
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = MAPPING_MODEL[lenses[index]]
         reader.default_focal_length_factor = DEFAULT_FOCAL
-        start = known.get(index)
-        if start is None and LENS_OF_MODEL[reader.camera_model] == "kannala_brandt":
-            start = fisheye_guess(scan.cameras[index], scan.sizes[index])
+        guess = fisheye_guess(reader.camera_model, scan.cameras[index], scan.sizes[index])
+        start = known.get(index, guess)
         if start is not None:
             reader.camera_params = ",".join(
                 map(repr, colmap_camera(start, reader.camera_model).params.tolist())
@@ -150,9 +143,8 @@ def write_features(
     with pycolmap.Database.open(database) as db:
         for index, lens in enumerate(lenses):
             model = MAPPING_MODEL[lens]
-            start = known.get(index)
-            if start is None and LENS_OF_MODEL[model] == "kannala_brandt":
-                start = fisheye_guess(scan.cameras[index], scan.sizes[index])
+            guess = fisheye_guess(model, scan.cameras[index], scan.sizes[index])
+            start = known.get(index, guess)
             camera = colmap_camera(start or _unseen_camera(scan, lenses, index), model, index + 1)
             camera.has_prior_focal_length = start is not None
             db.write_camera(camera, use_camera_id=True)

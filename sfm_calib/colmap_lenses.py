@@ -56,11 +56,13 @@ LEFT_OUT = {"p1", "p2", "s1", "s2", "s3", "s4"}
 FISHEYE_FOCAL = 0.5  # of the longer side: some 115 degrees across
 
 
-def fisheye_guess(name: str, size: tuple[int, int]) -> Camera:
-    """A fisheye of which nothing is known.
+def fisheye_guess(model: str, name: str, size: tuple[int, int]) -> Camera | None:
+    """A fisheye of which nothing is known, where one of COLMAP's models is one.
 
-    COLMAP verifies no pair of one whose focal length is its own guess.
+    COLMAP verifies no pair of a fisheye whose focal length is its own guess.
     """
+    if LENS_OF_MODEL[model] != "kannala_brandt":
+        return None
     params = nominal_params("kannala_brandt", size, FISHEYE_FOCAL * max(size))
     return Camera(name, "kannala_brandt", size, params)
 

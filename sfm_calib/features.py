@@ -22,6 +22,7 @@ from sfm_calib.images import Progress, Scan
 
 FILE = "features.npz"
 CONTRAST = 0.02  # COLMAP's; OpenCV's own, 0.04, finds half as many
+LEVELS_AN_OCTAVE = 3  # of scale, kept or left out whole, as COLMAP does
 BYTES_A_ROOT = 512.0  # COLMAP's scale of RootSIFT in a byte
 
 
@@ -41,7 +42,7 @@ class Features:
         return Features(self.pixels[:count], self.scales[:count], self.descriptors[:count])
 
     def spots(self) -> IntArray:
-        """The first feature (n,) at the same pixel: a blob with two orientations is two features."""
+        """The first feature (n,) at the same pixel: a blob of two orientations is two features."""
         _, first, inverse = np.unique(
             self.pixels, axis=0, return_index=True, return_inverse=True
         )  # `first` is the earliest of each
@@ -74,9 +75,17 @@ def features_of(path: Path, max_features: int) -> Features:
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     sizes = np.array([keypoint.size for keypoint in keypoints], dtype=np.float64)
-    largest = np.argsort(-sizes, kind="stable")[:max_features]
+    largest = np.argsort(-sizes, kind="stable")[: _whole_levels(sizes, max_features)]
     pixels = cv2.KeyPoint.convert(keypoints).astype(np.float64)
     return Features(pixels[largest], sizes[largest] / 2, _rooted(descriptors[largest]))
+
+
+def _whole_levels(sizes: FloatArray, max_features: int) -> int:
+    """How many of the largest features there are in the levels that the `max_features`th ends."""
+    if len(sizes) <= max_features:
+        return len(sizes)
+    level = np.round(LEVELS_AN_OCTAVE * np.log2(sizes))
+    return int((level >= np.sort(level)[-max_features]).sum())
 
 
 def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

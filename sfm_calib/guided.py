@@ -19,18 +19,16 @@ from graphs.build import GraphOptions
 from graphs.camera import Camera
 from graphs.frames import Transform
 from graphs.lenses import LensName
-from graphs.problem import IntArray, Observations, Problem
+from graphs.problem import Problem, images_seen
 from graphs.refine import refine
-from graphs.track_building import consistent_tracks, join_matches
 from sfm_calib import colmap, features
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.features import Features
 from sfm_calib.files import sha256
+from sfm_calib.fine_tracks import fine_problem
 from sfm_calib.formats.reading import CameraRig
 from sfm_calib.images import Progress, Scan
-from sfm_calib.line_matching import match_pairs, sight_of
 from sfm_calib.mapping import (
     DATABASE,
     MIN_MATCHES,
@@ -41,7 +39,7 @@ from sfm_calib.mapping import (
     reference_of,
 )
 from sfm_calib.nominal import lens_of
-from sfm_calib.overlap import LEAST_SHARED_VIEW, first_pairs, pairs_that_share, shared_view
+from sfm_calib.overlap import LEAST_SHARED_VIEW, first_pairs, shared_view
 from sfm_calib.pairs import Pair, choose_pairs
 from sfm_calib.worker import run_apart
 
@@ -85,9 +83,34 @@ def map_with_prior(
     )
     found = features.load(place)
     scales = {i.path: f.scales for i, f in zip(scan.images, found, strict=True)}
-    coarse, messages = problem_of(scan, config, lenses, models, models / DATABASE, scales)
-    coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
-    return Mapped(_matched_finely(scan, coarse, found, progress), messages, hashes)
+    try:
+        coarse, messages = problem_of(scan, config, lenses, models, models / DATABASE, scales)
+        _check_placed(coarse, scan)
+        coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
+    except CalibrationError as error:
+        return _without_old(scan, config, lenses, known, cache, progress, str(error))
+    return Mapped(fine_problem(scan, coarse, found, progress), messages, hashes)
+
+
+def _check_placed(coarse: Problem, scan: Scan) -> None:
+    placed, n = len(images_seen(coarse.observations)), len(scan.images)
+    if placed < ENOUGH_REGISTERED * n:
+        raise CalibrationError(f"only {placed} of {n} images could be placed")
+
+
+def _without_old(
+    scan: Scan,
+    config: RigConfig,
+    lenses: Sequence[LensName],
+    known: dict[int, Camera],
+    cache: Cache,
+    progress: Progress,
+    why: str,
+) -> Mapped:
+    """The scan mapped in full, of old the lenses alone for a start; and why."""
+    mapped = map_scan(scan, config, lenses, known, cache, progress)
+    said = f"the scan was mapped without the old calibration's help: with it, {why}"
+    return replace(mapped, messages=(said, *mapped.messages))
 
 
 def _nominal(scan: Scan, old: CameraRig, reference: int) -> dict[int, Transform]:
@@ -182,55 +205,3 @@ def _in_unit_of(problem: Problem, nominal: dict[int, Transform]) -> Problem:
     if not ratios:
         return problem
     return replace(problem, initial=problem.initial.scaled(float(np.median(ratios))))
-
-
-def _matched_finely(
-    scan: Scan, coarse: Problem, found: Sequence[Features], progress: Progress
-) -> Problem:
-    """The problem of all features, matched along the lines of a solved one."""
-    start = coarse.initial
-    frame_of = {name: number for number, name in enumerate(coarse.frame_names)}
-    number = np.full((len(scan.cameras), len(coarse.frame_names)), -1)
-    shown = np.zeros(number.shape, dtype=bool)
-    shown[coarse.observations.camera, coarse.observations.frame] = True
-    for i, image in enumerate(scan.images):
-        frame = frame_of.get(scan.frames[image.frame])
-        if frame is not None and shown[image.camera, frame]:
-            number[image.camera, frame] = i
-    sights, places = [None] * len(scan.images), [None] * len(scan.images)
-    for camera, frame in np.argwhere(number >= 0).tolist():
-        i = number[camera, frame]
-        sights[i] = sight_of(start.cameras[camera], found[i])
-        places[i] = start.cam_from_rig[camera] @ start.rig_from_world[frame]
-    pairs = pairs_that_share(coarse, number)
-    begins = np.concatenate([[0], np.cumsum([len(one) for one in found])])
-    spots = [one.spots() for one in found]
-    links = []
-    for done, ((a, b), matches) in enumerate(
-        zip(pairs, match_pairs(sights, places, pairs), strict=True), 1
-    ):
-        rows = [begins[a] + spots[a][matches[:, 0]], begins[b] + spots[b][matches[:, 1]]]
-        links.append(np.stack(rows, axis=1))
-        if done % PAIRS_A_STEP == 0 or done == len(pairs):
-            progress("matching along lines", done, len(pairs))
-    track = join_matches(int(begins[-1]), links)
-    seen = _observations(number, found, begins, track)
-    points, seen = consistent_tracks(start, seen)
-    return replace(coarse, initial=replace(start, points=points), observations=seen)
-
-
-def _observations(
-    number: IntArray, found: Sequence[Features], begins: IntArray, track: IntArray
-) -> Observations:
-    """Every feature of a track; a feature's track (n,) by the features of all images in a row."""
-    owner = np.repeat(np.arange(len(found)), np.diff(begins))
-    camera_of, frame_of = np.full(len(found), -1), np.full(len(found), -1)
-    cameras, frames = np.nonzero(number >= 0)
-    camera_of[number[cameras, frames]], frame_of[number[cameras, frames]] = cameras, frames
-    rows = np.flatnonzero(track >= 0)
-    pixels = np.concatenate([one.pixels for one in found])
-    scales = np.concatenate([one.scales for one in found])
-    return Observations(
-        pixels[rows], frame_of[owner[rows]], camera_of[owner[rows]], track[rows],
-        feature_scale=scales[rows],
-    )  # fmt: skip

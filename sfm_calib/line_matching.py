@@ -32,9 +32,9 @@ MOST_ANGLE = 0.7  # rad between descriptors
 class Sight:
     """What an image shows, as the kernel takes it."""
 
-    rays: FloatArray  # (n, 3) float32, unit; NaN where the lens sees nothing
+    rays: NDArray[np.float32]  # (n, 3) unit; NaN where the lens sees nothing
     descriptors: NDArray[np.int16]  # (n, 128)
-    lengths: FloatArray  # (n,) float32, of the descriptors
+    lengths: NDArray[np.float32]  # (n,) of the descriptors
     spots: IntArray  # (n,) as `Features.spots`
     px: float  # angle of a pixel
 
@@ -52,13 +52,13 @@ def match_pairs(
     sights: Sequence[Sight | None],
     cam_from_world: Sequence[Transform | None],
     pairs: Sequence[Pair],
-) -> Iterator[IntArray]:
-    """Matches (n, 2) of each pair of images in turn, indices of their features.
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Matches (n, 2) of each pair of images in turn, indices of their features; likeness (n,).
 
     Pairs are of images that have a place.
     """
 
-    def match(pair: Pair) -> IntArray:
+    def match(pair: Pair) -> tuple[IntArray, FloatArray]:
         a, b = (sights[i] for i in pair)
         from_a, from_b = (cam_from_world[i] for i in pair)
         assert a is not None and b is not None and from_a is not None and from_b is not None
@@ -68,17 +68,20 @@ def match_pairs(
         yield from pool.map(match, pairs)
 
 
-def match_along_lines(a: Sight, b: Sight, b_from_a: Transform) -> IntArray:
-    """Matches (n, 2) of two images, each the best of both near the lines of the other."""
+def match_along_lines(a: Sight, b: Sight, b_from_a: Transform) -> tuple[IntArray, FloatArray]:
+    """Matches (n, 2) of two images, each the best of both near the lines of the other.
+
+    And their likeness (n,), the cosine between descriptors.
+    """
     length = float(np.linalg.norm(b_from_a.translation))
     towards = b_from_a.translation / length if length > 0 else np.array([1.0, 0.0, 0.0])
     turned = (a.rays @ b_from_a.rotation.T).astype(np.float32)
-    partner = _match(
+    partner, likeness = _match(
         turned, a.descriptors, a.lengths, a.spots, b.rays, b.descriptors, b.lengths, b.spots,
         towards.astype(np.float32), np.float32(NEAR_LINE_PX * max(a.px, b.px)),
     )  # fmt: skip
     matched = np.flatnonzero(partner >= 0)
-    return np.stack([matched, partner[matched]], axis=1)
+    return np.stack([matched, partner[matched]], axis=1), likeness[matched].astype(np.float64)
 
 
 @njit(cache=True, nogil=True)
@@ -87,10 +90,10 @@ def _match(
     rays_b: Any, descriptors_b: Any, lengths_b: Any, spots_b: Any,
     towards: Any, near: Any,
 ) -> Any:  # fmt: skip
-    """The feature of b (n_a,) that matches each of a; -1: none. `rays_a` are turned into b's frame.
+    """The feature of b (n_a,) that matches each of a, -1: none, and how like it is.
 
-    A point at any depth before a is seen by b between its ray's direction, at infinity, and a's
-    place.
+    `rays_a` are turned into b's frame. A point at any depth before a is seen by b between its
+    ray's direction, at infinity, and a's place.
     """
     n_a, n_b = len(rays_a), len(rays_b)
     best_a, second_a = np.full(n_a, np.float32(-1)), np.full(n_a, np.float32(-1))
@@ -140,7 +143,7 @@ def _match(
         clear = _is_clear(best_a[i], second_a[i]) and _is_clear(best_b[j], second_b[j])
         if of_b[j] != i or not clear:
             of_a[i] = -1
-    return of_a
+    return of_a, best_a
 
 
 @njit(cache=True, nogil=True)

@@ -13,8 +13,9 @@ from sfm_calib.images import Scan
 from sfm_calib.pairs import Pair
 
 VIEW_GRID = (12, 9)  # rays across and down a view
-# Distances at which views may meet, in longest baselines: whatever stands in a room, to infinity.
-RANGES = (1.5, 3.0, 10.0, 1e3)
+# Distances at which views may meet, in longest baselines: between cameras that face each other,
+# whatever stands in a room, infinity.
+RANGES = (0.5, 1.5, 3.0, 10.0, 1e3)
 LEAST_SHARED_VIEW = 0.05  # of a view; a camera turned by 3 deg moves its view by as much
 OWN_STEPS = (1, 2, 4, 8)  # frames, to the same camera: its lens is known, wide steps come later
 OTHER_STEPS = (0, 1)  # frames, to cameras that look the same way

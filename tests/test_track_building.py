@@ -1,0 +1,106 @@
+"""Tracks of matches: joined without contradictions, taken apart where they show two points."""
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic.problems import small_problem
+
+from graphs.problem import Observations, joined
+from graphs.track_building import GATE_PX, consistent_tracks, join_matches, nearest_points
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 10_000))
+def test_no_image_is_in_a_track_twice(seed):
+    rng = np.random.default_rng(seed)
+    image = np.sort(rng.integers(0, 8, 60))
+    links = rng.integers(0, 60, (80, 2))
+    track = join_matches(image, links, rng.random(80))
+    pairs = np.stack([track, image], axis=1)[track >= 0]
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    assert (np.bincount(pairs[:, 0]) >= 2).all() if len(pairs) else (track == -1).all()
+
+
+def test_matches_that_agree_are_joined_whatever_their_order():
+    image = np.tile(np.arange(5), 3)  # three points, seen by five images
+    links = np.array([[3 * 0 + i + 5 * p, i + 1 + 5 * p] for p in range(3) for i in range(4)])
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        track = join_matches(image, links[rng.permutation(len(links))], rng.random(len(links)))
+        assert [len(set(track[5 * p : 5 * p + 5])) for p in range(3)] == [1, 1, 1]
+        assert len(set(track)) == 3
+
+
+def test_the_likest_match_wins_a_contradiction():
+    image = np.array([0, 1, 1])
+    track = join_matches(image, np.array([[0, 1], [0, 2]]), np.array([0.8, 0.9]))
+    assert track[0] == track[2] >= 0 and track[1] == -1
+
+
+def test_without_matches_there_are_no_tracks():
+    track = join_matches(np.arange(4), np.zeros((0, 2), dtype=np.int64), np.zeros(0))
+    assert (track == -1).all()
+
+
+def exact(lens="radial", **how):
+    """A problem at its truth, and without noise."""
+    problem, true = small_problem(lens, sigma_px=0.0, start_error=0.0, **how)
+    return true, problem.observations
+
+
+def test_points_are_found_from_the_rays_alone():
+    for lens in ("radial", "kannala_brandt"):
+        true, seen = exact(lens, points=40)
+        points, kept, which = consistent_tracks(replace(true, points=np.zeros((0, 3))), seen)
+        assert len(kept) == len(seen) and sorted(which) == list(range(len(seen)))
+        np.testing.assert_allclose(points[kept.point], true.points[seen.point[which]], atol=1e-6)
+
+
+def test_a_track_of_two_points_is_taken_apart():
+    true, seen = exact(points=40, frames=6)
+    merged = replace(seen, point=seen.point // 2)
+    points, kept, which = consistent_tracks(true, merged)
+    # An image that sees both points keeps each: a point has the best of an image, not the track.
+    assert len(kept) > 0.98 * len(seen)
+    # Where the other's rays pass by within the gate, a few of them pull.
+    off = np.linalg.norm(points[kept.point] - true.points[seen.point[which]], axis=1)
+    assert (off < 1e-6).mean() > 0.95 and (off < 0.05).mean() > 0.99
+
+
+def test_wrong_observations_are_left_out_and_take_nothing_with_them():
+    true, seen = exact(points=40, frames=8)
+    wrong = np.zeros(len(seen), dtype=bool)
+    wrong[::9] = True
+    pixels = seen.pixels + np.where(wrong, 15 * GATE_PX, 0.0)[:, None]
+    points, kept, which = consistent_tracks(true, replace(seen, pixels=pixels))
+    good = ~wrong[which]
+    assert good.sum() > 0.95 * (~wrong).sum()
+    right = np.linalg.norm(points[kept.point] - true.points[seen.point[which]], axis=1) < 1e-6
+    assert right[good].mean() > 0.99
+
+
+def test_of_two_observations_in_an_image_the_better_stays():
+    true, seen = exact(points=20)
+    double = seen.subset(np.arange(len(seen)) == 0)
+    double = replace(double, pixels=double.pixels + GATE_PX / 2)
+    _, kept, which = consistent_tracks(true, joined([seen, double]))
+    assert 0 in which and len(seen) not in which and len(kept) == len(seen)
+
+
+def test_nothing_comes_of_nothing():
+    true, _ = exact()
+    none = np.zeros(0, dtype=np.int64)
+    points, kept, which = consistent_tracks(true, Observations(np.zeros((0, 2)), none, none, none))
+    assert points.shape == (0, 3) and len(kept) == len(which) == 0
+
+
+def test_the_nearest_point_of_rays_that_meet():
+    rng = np.random.default_rng(0)
+    point = np.array([[0.5, -0.2, 4.0], [1.0, 2.0, 9.0]])
+    centres = rng.normal(size=(10, 3))
+    track = np.arange(10) % 2
+    rays = point[track] - centres
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    np.testing.assert_allclose(nearest_points(centres, rays, track), point, atol=1e-8)
