@@ -154,7 +154,7 @@ def whitening(prior: PriorRig) -> FloatArray:
         return np.zeros((0, len(names)))
     basis = np.eye(len(names))[:, known]
     unit = [] if prior.unit is None else [names.index(n) for n in pose_names(prior.unit)[3:]]
-    if not prior.metric and set(unit) <= set(known):
+    if unit and not prior.metric and set(unit) <= set(known):
         index = next(i for i, camera in enumerate(prior.cameras) if camera.name == prior.unit)
         along = prior.cam_from_rig[index].inverse.translation
         across = np.linalg.svd(along[None])[2][1:]

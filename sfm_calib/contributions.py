@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from graphs.camera import Camera
 from graphs.compare import Stated
 from graphs.covariance import Covariance
@@ -23,7 +25,8 @@ def contributions_of(
     without what errs together. Rotations are rotation vectors, in rad.
     """
     shares = shares_of_prior(prior, model, metric)
-    was = dict(_values(prior.cameras, prior.cam_from_rig))
+    unit = 1.0 if metric else _unit_of(prior, best)
+    was = dict(_values(prior.cameras, [place.scaled(unit) for place in prior.cam_from_rig]))
     results, others = (
         dict(_values(side.estimate.cameras, side.estimate.cam_from_rig)) for side in (best, alone)
     )
@@ -32,7 +35,7 @@ def contributions_of(
     return {
         name: Contribution(
             old=value,
-            sigma_old=sigma_old.get(name),
+            sigma_old=_scaled(sigma_old.get(name), unit if _is_length(name) else 1.0),
             new_alone=others[name],
             result=results[name],
             sigma=sigma.get(name, 0.0),
@@ -41,8 +44,30 @@ def contributions_of(
         for name, value in was.items()
         if name in results
         and name not in origin
-        and (prior.metric == metric or ".translation_" not in name)
+        and (prior.metric == metric or not _is_length(name))
     }
+
+
+def _is_length(name: str) -> bool:
+    return ".translation_" in name
+
+
+def _scaled(sigma: float | None, by: float) -> float | None:
+    return None if sigma is None else by * sigma
+
+
+def _unit_of(prior: PriorRig, best: Stated) -> float:
+    """How long a prior's unit of length is in the result's, by the camera farthest out."""
+    placed = {
+        camera.name: place.translation
+        for camera, place in zip(best.estimate.cameras, best.estimate.cam_from_rig, strict=True)
+    }
+    lengths = {
+        camera.name: float(np.linalg.norm(place.translation))
+        for camera, place in zip(prior.cameras, prior.cam_from_rig, strict=True)
+    }
+    far = max(lengths, key=lambda name: lengths[name])
+    return float(np.linalg.norm(placed[far])) / lengths[far] if lengths[far] > 0 else 1.0
 
 
 def _values(cameras: Sequence[Camera], places: Sequence[Transform]) -> Iterator[tuple[str, float]]:

@@ -115,7 +115,7 @@ def judge(
         )
     if scale_free and len(old.estimate.cameras) > 1:
         size = "the baseline's length" if len(old.estimate.cameras) == 2 else "the rig's size"
-        said.append(f"the scan has no metric scale: {size} is not judged")
+        said.append(f"the two have no metric scale in common: {size} is not judged")
     record = _record(found, unit, options.old_sigma_px if assumed else None, tuple(said))
     of_old = found.verdict == "inconclusive" and not cov_difference and _of_old(found, tested)
     lines = tuple(verdict_lines(record, of_old))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from sfm_calib.compare_sides import renamed
 from sfm_calib.config import BaselineConfig, RigConfig
 from sfm_calib.drift import EXACT, DriftOptions
 from sfm_calib.errors import CalibrationError, nearest
-from sfm_calib.formats import CameraRig
+from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.images import Scan
 from sfm_calib.lifted import lifted
 from sfm_calib.nominal import LONE_LENS, RIG_LENS
-from sfm_calib.partial import reference_of, stated_of
+from sfm_calib.partial import reference_of, seen_from, stated_of
 from sfm_calib.prior import checked
 from sfm_calib.uncertainty import Unit
 
@@ -54,25 +55,20 @@ class OldCalibration:
         return own if own in names else self.common(names)[0]
 
     def baseline(self, names: Sequence[str]) -> BaselineConfig | None:
-        """Its longest distance from the reference to a camera of the scan, where it has metres."""
-        if self.unit != "m":
-            return None
-        reference = self.reference(names)
-        estimate, covariance = self.stated.estimate, self.stated.covariance
-        origin = estimate.cam_from_rig[self.rig.names.index(reference)].inverse.translation
-        apart = {
-            name: estimate.cam_from_rig[self.rig.names.index(name)].inverse.translation - origin
-            for name in self.common(names)
+        """Its longest distance between two of these cameras, where it has metres."""
+        stated, known = self.stated, self.rig.names
+        centres = [t.inverse.translation for t in stated.estimate.cam_from_rig]
+        lengths = {
+            (a, b): float(np.linalg.norm(centres[known.index(a)] - centres[known.index(b)]))
+            for a, b in combinations(self.common(names), 2)
         }
-        far = max(apart, key=lambda name: float(np.linalg.norm(apart[name])))
-        length = float(np.linalg.norm(apart[far]))
-        if length <= 0:
+        if self.unit != "m" or not any(lengths.values()):
             return None
-        pair = (self.rig.names.index(reference), self.rig.names.index(far))
-        side = Stated(estimate, covariance)
-        sigma = pair_place(side, side, pair).sigma_baselines[0]
+        a, b = max(lengths, key=lambda pair: lengths[pair])
+        sigma = pair_place(stated, stated, (known.index(a), known.index(b))).sigma_baselines[0]
+        length = lengths[a, b]
         return BaselineConfig(
-            cameras=(reference, far), length_m=length, sigma_m=max(sigma, LEAST_RELATIVE * length)
+            cameras=(a, b), length_m=length, sigma_m=max(sigma, LEAST_RELATIVE * length)
         )
 
 
@@ -83,17 +79,18 @@ def old_calibration(
 
     cameras: `name in OLD=name in the scan`, where the names do not tell. options: how right a file
     without sigmas is taken to be. Raises CalibrationError where no camera is in both, where image
-    sizes differ, and where it does not say how its cameras sit.
+    sizes differ or nothing tells them, and where it does not say how its cameras sit.
     """
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
+    _check_sizes(rig)
     rig, unit = _in_unit(rig)
     least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
     rig, told = lifted(rig, least, options.old_sigma_px, options.range(unit or "m"))
     assumed = not rig.states_sigmas
     if assumed:
-        side = stated_of(rig)
         reference = rig.names.index(reference_of(rig))
+        side = seen_from(stated_of(rig), rig.names[reference])
         covariance = assumed_covariance(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
@@ -125,6 +122,16 @@ def _named_as(
         twice = next(n for n in called.values() if list(called.values()).count(n) > 1)
         raise CalibrationError(f"--cameras {' '.join(wanted)}: two cameras of OLD are {twice}")
     return renamed(read, list(called.values())), notes
+
+
+def _check_sizes(rig: CameraRig) -> None:
+    """Raises CalibrationError for a camera without a size of its images, and without images."""
+    for camera in rig.cameras:
+        if camera.size == NO_SIZE:
+            raise CalibrationError(
+                f"{rig.path} does not say how large the images of {camera.name} are, and the scan "
+                "has none of it: add the size, or scan with that camera too"
+            )
 
 
 def _in_unit(rig: CameraRig) -> tuple[CameraRig, Unit | None]:

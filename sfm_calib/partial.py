@@ -56,13 +56,20 @@ class Completed:
     scale: ScaleTie | None  # None: nothing had to be scaled
 
 
-def with_missing(new: CameraRig, old: CameraRig, unmoved: Sequence[str] | None = None) -> Completed:
-    """The new calibration with the cameras of OLD that it lacks, in the frame of OLD's reference.
+def with_missing(
+    new: CameraRig,
+    old: CameraRig,
+    unmoved: Sequence[str] | None = None,
+    reference: str | None = None,
+) -> Completed:
+    """The new calibration with the cameras of OLD that it lacks.
+
+    reference: the solved camera whose frame is the rig's; else OLD's own, or the tie.
 
     unmoved: solved cameras whose place the drift test did not doubt, best first: the first is the
-    tie, and lengths are compared among them. Else all common ones, OLD's reference first. Where
-    OLD's reference was not solved, the tie is the reference. Beside kept cameras, lengths are in
-    metres where one of the two has them, else in OLD's unit; without any, as the scan has them.
+    tie, and lengths are compared among them. Else all common ones, OLD's reference first. Beside
+    kept cameras, lengths are in metres where one of the two has them, else in OLD's unit; without
+    any, as the scan has them.
     Raises CalibrationError where nothing ties the two, or gives them one unit of length.
     """
     kept = tuple(name for name in old.names if name not in new.names)
@@ -74,7 +81,7 @@ def with_missing(new: CameraRig, old: CameraRig, unmoved: Sequence[str] | None =
             "place: give a calibration that holds the rig, or scan with every camera"
         )
     of_old = reference_of(old)
-    reference = of_old if of_old in new.names else ties[0]
+    reference = reference or (of_old if of_old in new.names else ties[0])
     sides = tuple(seen_from(stated_of(read), ties[0]) for read in (old, new))
     pair = _scale_pair(new, old, sides[0], ties) if kept else None
     stated, scale = _joined(sides[0], sides[1], kept, pair, new.unit == "m")
@@ -257,7 +264,8 @@ def completed(
 
     Of that, `kept` and `added` are filled in here. Raises CalibrationError as `with_missing`.
     """
-    found = with_missing(rig_of(calibration, Path("the scan")), old, unmoved)
+    scan = rig_of(calibration, Path("the scan"))
+    found = with_missing(scan, old, unmoved, calibration.rig.reference)
     estimate, covariance = found.stated.estimate, found.stated.covariance
     sigma, cameras = covariance.sigma, {}
     for camera in estimate.cameras:

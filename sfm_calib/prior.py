@@ -87,7 +87,7 @@ def checked(old: CameraRig, sizes: Mapping[str, tuple[int, int]]) -> CameraRig:
     if not set(old.names) & set(sizes):
         raise CalibrationError(
             f"{old.path} has the cameras {', '.join(old.names)}, the scan {', '.join(sizes)}: none "
-            "is in both; name the scan's folders as the calibration names its cameras"
+            f"is in both; say which are the same: --cameras {old.names[0]}={next(iter(sizes))}"
         )
     if old.cam_from_rig is None and len(old.cameras) > 1:
         raise CalibrationError(
@@ -109,7 +109,7 @@ def checked(old: CameraRig, sizes: Mapping[str, tuple[int, int]]) -> CameraRig:
 def with_lenses(config: RigConfig, old: CameraRig, cameras: Sequence[str]) -> RigConfig:
     """The configuration with the lens of each of `cameras` that the calibration knows.
 
-    Raises CalibrationError where rig.yaml says that it has another.
+    Raises CalibrationError where rig.yaml, or --lens, says that it has another.
     """
     entries = dict(config.cameras)
     for camera in old.cameras:
@@ -121,6 +121,11 @@ def with_lenses(config: RigConfig, old: CameraRig, cameras: Sequence[str]) -> Ri
             raise CalibrationError(
                 f"rig.yaml gives {camera.name} the lens {said}, and {old.path} has {camera.lens}: "
                 "take it out of rig.yaml"
+            )
+        if said is None and config.lens not in ("auto", camera.lens):
+            raise CalibrationError(
+                f"--lens {config.lens}: {old.path} has {camera.name} in the lens {camera.lens}, "
+                "and is held against the same alone: leave it out, or calibrate anew"
             )
         known = {"lens": camera.lens}
         entries[camera.name] = (

@@ -21,6 +21,7 @@ from graphs.consider import completed as with_old_errors
 from graphs.consider import cov_difference, sensitivity
 from graphs.covariance import Covariance
 from graphs.drift_picture import Group, lens_columns
+from graphs.ladder import Ladder
 from graphs.problem import PriorMode, PriorRig
 from graphs.propagation import lens_names, marginal, pose_names
 from graphs.refine import Refinement
@@ -30,15 +31,17 @@ from sfm_calib.cache import Cache
 from sfm_calib.calibrate import (
     Outcome,
     Stopwatch,
+    certificate_of,
     checked_scan,
+    choose_lens,
     enough_placed,
     own_covariance_of,
     refusals,
     solve_problem,
 )
-from sfm_calib.config import RigConfig
+from sfm_calib.config import BaselineConfig, RigConfig
 from sfm_calib.contributions import contributions_of
-from sfm_calib.drift import DriftOptions, Judged, judge
+from sfm_calib.drift import DriftOptions, judge
 from sfm_calib.drift_record import DriftRecord
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
@@ -49,7 +52,10 @@ from sfm_calib.nominal import check_config, start_from_config
 from sfm_calib.old_calibration import OldCalibration, old_calibration, with_scale_of
 from sfm_calib.partial import completed
 from sfm_calib.prior import prior_of, started, with_lenses
-from sfm_calib.recalibration_record import OldFile, Recalibration
+from sfm_calib.provenance import Replaced
+from sfm_calib.recalibration_record import Contribution, OldFile, Recalibration
+from sfm_calib.recalibration_words import assumption, messages_of, with_metres_of
+from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
 
@@ -62,7 +68,7 @@ class RecalibrateOptions(BaseModel):
     prior: PriorMode = "weak"
     """start: OLD only says where to start; weak: the wide beliefs of every calibration are centred
     on it; full: it is believed as far as its covariance says, unless the scan contradicts it."""
-    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT")] = ("all",)
+    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT"), Field(min_length=1)] = ("all",)
     """What is estimated anew: all, intrinsics, extrinsics, focal, principal_point, distortion,
     rotation, translation, a camera, or one of these of a camera (right.rotation)."""
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OLD=SCAN")] = ()
@@ -88,6 +94,8 @@ class Solved:
     split: SplitCheck | None
     prior: PriorRig
     cov_change: Covariance | None  # of it less the old calibration; None: they are independent
+    baseline: BaselineConfig | None  # the old one that gave the metres
+    ladder: Ladder | None  # of cameras that the old calibration lacks
 
     @property
     def side(self) -> Stated:
@@ -111,12 +119,11 @@ def recalibrate(
     drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the
     two have no camera in common.
     """
-    watch = Stopwatch()
+    watch, replaces = Stopwatch(), _replaced(read)
     if options.metres is not None:
         read = read.metric(options.metres)
     scan = checked_scan(scan_path, config, cache, progress, watch)
     old = old_calibration(read, scan, options.cameras, drift)
-    has_scale = bool(config.scale.measured)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
     with watch.stage("tracks and mapping"):
@@ -124,28 +131,32 @@ def recalibrate(
     given = Given(scan, config, mapped, command)
     with enough_placed(mapped.problem, len(scan.images)):
         careful: PriorMode = "start" if options.prior == "start" else "weak"
-        alone = _solve(given, old, careful, options.free, watch, progress)
+        alone = _solve(given, old, careful, options.free, scan.cameras, watch, progress)
         with watch.stage("drift"), refusals():
-            found = _drift(old, alone, drift, scale_free=not has_scale)
+            found = _drift(given, old, alone, drift, options.free)
+        stayed = _unmoved(found, config.reference)
         best = alone
-        if options.prior == "full" and found.record.verdict != "replace":
-            best = _solve(given, old, "full", options.free, watch, progress)
+        if options.prior == "full" and found.verdict != "replace":
+            best = _solve(given, old, "full", options.free, scan.cameras, watch, progress, alone)
+        elif alone.baseline and len(stayed) > 1 and not set(alone.baseline.cameras) <= set(stayed):
+            best = _solve(given, old, careful, options.free, stayed, watch, progress, alone)
+    with watch.stage("certificate"):
+        certificate = certificate_of(best.refinement, config, progress)
     run = Run(
         scan, config, mapped, best.refinement, best.covariance, watch.seconds, command,
-        split=best.split,
+        best.ladder, best.split, certificate,
     )  # fmt: skip
     calibration, unit = summarise(run)
-    record = Recalibration(
-        old=OldFile(path=str(read.path), sha256=calibration_sha256(read.path), format=read.format),
-        prior=best.prior.mode,
-        freed=options.free,
-        contributions=contributions_of(
-            best.prior, best.side, alone.side, best.covariance.model, calibration.rig.metric
-        ),
-        drift=found.record,
-    )
-    whole = completed(calibration, old.rig, record, _unmoved(found.record))
-    return Recalibrated(Outcome(whole, best.refinement, unit), found.record)
+    calibration = _told(calibration, old, config, options, best, found, stayed)
+    record = Recalibration(old=replaces, prior=best.prior.mode, freed=options.free, drift=found)
+    whole = completed(calibration, old.rig, record, stayed or None)
+    by = _size(whole) / _size(calibration)
+    contributions = contributions_of(
+        best.prior, best.side.scaled(by), alone.side.scaled(by), best.covariance.model,
+        whole.rig.metric,
+    )  # fmt: skip
+    whole = _recorded(whole, contributions, replaces)
+    return Recalibrated(Outcome(whole, best.refinement, unit * by), found)
 
 
 def _with_reference(config: RigConfig, old: OldCalibration, names: Sequence[str]) -> RigConfig:
@@ -163,40 +174,63 @@ def _solve(
     old: OldCalibration,
     mode: PriorMode,
     free: Sequence[str],
+    measured: Sequence[str],
     watch: Stopwatch,
     progress: Progress,
+    before: Solved | None = None,
 ) -> Solved:
-    """The optimum of a scan under one use of the old calibration, with its covariance."""
+    """The optimum of a scan under one use of the old calibration, with its covariance.
+
+    measured: cameras whose old distance may give the metres. before: a first one.
+    """
     scan, config = given.scan, given.config
     assert config.reference is not None
     prior = prior_of(old.rig, mode, free, scan.cameras, config.reference)
-    if not prior.gives_scale:
-        config = with_scale_of(config, old.baseline(scan.cameras))
+    baseline = None
+    if not prior.gives_scale and not config.scale.measured:
+        baseline = old.baseline(measured)
+        config = with_scale_of(config, baseline)
     problem = started(start_from_config(given.mapped.problem, config), prior)
-    with watch.stage(f"solving ({mode})"):
-        refinement = solve_problem(problem, config, progress)
-    with watch.stage(f"covariance ({mode})"):
+    ladder = before.ladder if before else None
+    if before is None:
+        with watch.stage("choosing the lens"):
+            ladder = choose_lens(problem, config, progress)
+    which = f"{mode}, again" if before and before.prior.mode == mode else mode
+    with watch.stage(f"solving ({which})"):
+        refinement = solve_problem(problem, config, progress, ladder)
+    with watch.stage(f"covariance ({which})"):
         covariance, split = own_covariance_of(refinement, config, progress)
         if not prior.held and mode != "full":
-            return Solved(refinement, covariance, split, prior, None)
+            return Solved(refinement, covariance, split, prior, None, baseline, ladder)
         with refusals():
             how = sensitivity(
                 refinement.graph, refinement.estimate, refinement.values, covariance.basis
             )
         cov_change = cov_difference(covariance.stated, how)
-        return Solved(refinement, with_old_errors(covariance, how), split, prior, cov_change)
+    covariance = with_old_errors(covariance, how)
+    return Solved(refinement, covariance, split, prior, cov_change, baseline, ladder)
 
 
-def _drift(old: OldCalibration, new: Solved, options: DriftOptions, scale_free: bool) -> Judged:
+def _drift(
+    given: Given, old: OldCalibration, new: Solved, options: DriftOptions, free: Sequence[str]
+) -> DriftRecord:
     """Of the cameras that both have."""
     names = old.common([camera.name for camera in new.refinement.estimate.cameras])
     before = _part(old.own if new.cov_change is None else old.stated, names)
     after = _part(new.side, names)
-    return judge(
+    notes, assumed = list(old.notes), old.assumed and new.cov_change is not None
+    if assumed:
+        notes.append(assumption(old, options.old_sigma_px))
+    if new.prior.held:
+        notes.append(f"only {', '.join(free)} was freed and judged: the rest counts as unchanged")
+    # Lengths are compared where each side has metres of its own.
+    scale_free = not (given.config.scale.measured and old.unit == "m")
+    record = judge(
         before, after, old.unit or "m", options,
-        scale_free=scale_free, tested=set(_tested(before, new.prior.held)), cov_difference=new.cov_change,
-        notes=old.notes,
-    )  # fmt: skip
+        scale_free=scale_free, tested=set(_tested(before, new.prior.held)),
+        cov_difference=new.cov_change, notes=notes,
+    ).record  # fmt: skip
+    return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
 
 
 def _part(side: Stated, names: Sequence[str]) -> Stated:
@@ -233,8 +267,68 @@ def _tested(side: Stated, held: frozenset[str]) -> Iterator[tuple[str, Group]]:
             yield camera.name, "translation"
 
 
-def _unmoved(found: DriftRecord) -> tuple[str, ...] | None:
-    """Cameras that kept their places, where it can be told which moved."""
+def _unmoved(found: DriftRecord, reference: str | None) -> tuple[str, ...]:
+    """Cameras that kept their places, the reference first, where it can be told which moved."""
     if len(found.moved) != 1:
-        return None
-    return tuple(name for name in found.cameras if name not in found.moved[0]) or None
+        return ()
+    stayed = (name for name in found.cameras if name not in found.moved[0])
+    return tuple(sorted(stayed, key=lambda name: name != reference))
+
+
+# ---- the result ----------------------------------------------------------------------------
+
+
+def _replaced(read: CameraRig) -> OldFile:
+    return OldFile(path=str(read.path), sha256=calibration_sha256(read.path), format=read.format)
+
+
+def _told(
+    calibration: Calibration,
+    old: OldCalibration,
+    config: RigConfig,
+    options: RecalibrateOptions,
+    best: Solved,
+    found: DriftRecord,
+    stayed: Sequence[str],
+) -> Calibration:
+    """With what is to be known of it as a recalibration."""
+    assert calibration.verdict is not None
+    verdict, rig = calibration.verdict, calibration.rig
+    used, missing = best.prior.mode, set(old.rig.names) - set(calibration.cameras)
+    leaning = used == "full" or bool(best.prior.held or missing)
+    said = messages_of(
+        old, config, options.prior, used, best.baseline, stayed, leaning, found, verdict
+    )
+    scale = with_metres_of(rig.scale, best.baseline)
+    return calibration.model_copy(
+        update={
+            "verdict": verdict.model_copy(update={"messages": (*said, *verdict.messages)}),
+            "rig": rig.model_copy(update={"scale": scale}),
+        }
+    )
+
+
+def _size(calibration: Calibration) -> float:
+    """The farthest of the cameras that the scan has, from the reference; 1 of one camera."""
+    lengths = [
+        float(np.linalg.norm(placed.translation))
+        for name, placed in calibration.rig.cam_from_rig.items()
+        if not calibration.cameras[name].kept_from
+    ]
+    return max(lengths) or 1.0
+
+
+def _recorded(
+    whole: Calibration, contributions: dict[str, Contribution], old: OldFile
+) -> Calibration:
+    """With what the old calibration contributed, and as what takes its place."""
+    assert whole.recalibration is not None
+    replaces = Replaced(path=old.path, sha256=old.sha256)
+    return whole.model_copy(
+        update={
+            "recalibration": whole.recalibration.model_copy(
+                update={"contributions": contributions}
+            ),
+            "provenance": whole.provenance.model_copy(update={"replaces": replaces}),
+        }
+    )
