@@ -31,10 +31,12 @@ from sfm_calib.formats.reading import CameraRig
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping import (
     DATABASE,
+    ENOUGH_REGISTERED,
     MIN_MATCHES,
     Mapped,
     check_overlap,
     map_matched,
+    map_scan,
     problem_of,
     reference_of,
 )
