@@ -28,6 +28,19 @@ def compare_with_truth(estimate: Calibration, truth: Calibration) -> list[TruthR
     return rows
 
 
+def compare_in_both(estimate: Calibration, truth: Calibration) -> list[TruthRow]:
+    """As `compare_with_truth`, of the cameras that both have: its reference must be one of them."""
+    both = [name for name in estimate.cameras if name in truth.cameras]
+    return compare_with_truth(_only(estimate, both), _only(truth, both))
+
+
+def _only(calibration: Calibration, names: Collection[str]) -> Calibration:
+    cameras = {name: calibration.cameras[name] for name in names}
+    placed = {name: calibration.rig.cam_from_rig[name] for name in names}
+    rig = calibration.rig.model_copy(update={"cam_from_rig": placed})
+    return calibration.model_copy(update={"cameras": cameras, "rig": rig})
+
+
 def check_same_cameras(names: Collection[str], truth: Calibration) -> None:
     """Raises CalibrationError when a truth is not of these cameras."""
     if set(names) != set(truth.cameras):

@@ -334,7 +334,7 @@ def _retold(whole: result.Calibration, found: Completed) -> dict[str, object]:
     """What is said of the covariance, anew where it changed."""
     estimate, covariance = found.stated.estimate, found.stated.covariance
     told: dict[str, object] = {}
-    if whole.uncertainty is not None:
+    if whole.uncertainty is not None and found.kept:  # else it is the scan's
         told["uncertainty"] = uncertainty_of(
             estimate, covariance, whole.uncertainty.sigma_px, unit_of(whole)
         )

@@ -227,7 +227,7 @@ def _drift(
     scale_free = not (given.config.scale.measured and old.unit == "m")
     record = judge(
         before, after, old.unit or "m", options,
-        scale_free=scale_free, tested=set(_tested(before, new.prior.held)),
+        scale_free=scale_free, tested=set(_tested(before, new.prior)),
         cov_difference=new.cov_change, notes=notes,
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
@@ -253,18 +253,26 @@ def _part(side: Stated, names: Sequence[str]) -> Stated:
     )
 
 
-def _tested(side: Stated, held: frozenset[str]) -> Iterator[tuple[str, Group]]:
-    """The groups of each camera of which anything was freed."""
+def _tested(side: Stated, prior: PriorRig) -> Iterator[tuple[str, Group]]:
+    """The groups of each camera of which anything was freed.
+
+    The reference moves where all others do: what is held of one of them says that it did not.
+    """
     for camera in side.estimate.cameras:
         names = lens_names(camera)
         for group, columns in lens_columns(camera):
-            if any(names[column] not in held for column in columns):
+            if any(names[column] not in prior.held for column in columns):
                 yield camera.name, group
-        place = pose_names(camera.name)
-        if any(name not in held for name in place[:3]):
-            yield camera.name, "rotation"
-        if any(name not in held for name in place[3:]):
-            yield camera.name, "translation"
+    placed = [camera.name for camera in side.estimate.cameras if camera.name != prior.reference]
+    of_place: tuple[tuple[Group, slice], ...] = (
+        ("rotation", slice(0, 3)),
+        ("translation", slice(3, 6)),
+    )
+    for group, part in of_place:
+        free = [name for name in placed if not prior.held.issuperset(pose_names(name)[part])]
+        yield from ((name, group) for name in free)
+        if free == placed:
+            yield prior.reference, group
 
 
 def _unmoved(found: DriftRecord, reference: str | None) -> tuple[str, ...]:

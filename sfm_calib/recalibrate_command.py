@@ -11,7 +11,7 @@ import tyro
 
 from sfm_calib.cache import Cache
 from sfm_calib.colmap import quiet
-from sfm_calib.comparison import check_same_cameras, compare_with_truth
+from sfm_calib.comparison import check_same_cameras, compare_in_both
 from sfm_calib.config import Options, RigConfig
 from sfm_calib.drift import EXIT_STATUS, DriftOptions
 from sfm_calib.drift_terminal import print_drift
@@ -69,7 +69,8 @@ def run_recalibrate(command: Recalibrate, config: RigConfig, arguments: Sequence
     old = read_calibration(command.old)
     truth = load_calibration(command.truth) if command.truth else None
     if truth:
-        check_same_cameras(camera_names(command.scan), truth)
+        own = camera_names(command.scan)
+        check_same_cameras([*own, *(n for n in truth.cameras if n in old.names)], truth)
     quiet(command.verbose)
     with output_folder(command.out):
         with progress_bars() as progress:
@@ -80,6 +81,6 @@ def run_recalibrate(command: Recalibrate, config: RigConfig, arguments: Sequence
             )  # fmt: skip
         if not command.json:
             print_drift(done.drift, result_console())
-        rows = compare_with_truth(done.outcome.calibration, truth) if truth else []
+        rows = compare_in_both(done.outcome.calibration, truth) if truth else []
         finish(done.outcome, command.out, rows, command.json, command.export)
     return EXIT_STATUS[done.drift.verdict] if command.exit_code else 0
