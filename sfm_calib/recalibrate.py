@@ -195,7 +195,7 @@ def _drift(old: OldCalibration, new: Solved, options: DriftOptions, scale_free: 
     return judge(
         before, after, old.unit or "m", options,
         scale_free=scale_free, tested=set(_tested(before, new.prior.held)), cov_difference=new.cov_change,
-        notes=old.notes,
+        notes=old.notes, n_frames=len(new.refinement.problem.frame_names),
     )  # fmt: skip
 
 
