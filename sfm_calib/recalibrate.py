@@ -229,6 +229,7 @@ def _drift(
         before, after, old.unit or "m", options,
         scale_free=scale_free, tested=set(_tested(before, new.prior)),
         cov_difference=new.cov_change, notes=notes,
+        n_frames=len(new.refinement.problem.frame_names), n_frames_old=old.rig.n_frames,
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
 
