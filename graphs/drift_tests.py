@@ -154,9 +154,12 @@ def changes(
         picture(_between(a, b), distance)
         for a, b in zip(old.estimate.cameras, new.estimate.cameras, strict=True)
     )
+    known = [count for count in n_frames if count is not None]
+    # Of a difference that was given, both sides have a part, and the fewer frames count.
+    counts = list(reversed(n_frames)) if cov_difference is None else [min(known, default=None)]
     guesses = tuple(
         Guess(part, max(count - 1.0, 1.0))
-        for part, count in zip(parts, reversed(n_frames), strict=False)
+        for part, count in zip(parts, counts, strict=True)
         if count is not None
     )
     return Changes(old.estimate, pictures, freed, tuple(names), change, np.sum(parts, 0), guesses)
