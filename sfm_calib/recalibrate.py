@@ -54,7 +54,7 @@ from sfm_calib.partial import completed
 from sfm_calib.prior import prior_of, started, with_lenses
 from sfm_calib.provenance import Replaced
 from sfm_calib.recalibration_record import Contribution, OldFile, Recalibration
-from sfm_calib.recalibration_words import assumption, messages_of, with_metres_of
+from sfm_calib.recalibration_words import assumption, doubted, messages_of, with_metres_of
 from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
@@ -147,6 +147,7 @@ def recalibrate(
         best.ladder, best.split, certificate,
     )  # fmt: skip
     calibration, unit = summarise(run)
+    found = doubted(found, calibration.verdict)
     calibration = _told(calibration, old, config, options, best, found, stayed)
     record = Recalibration(old=replaces, prior=best.prior.mode, freed=options.free, drift=found)
     whole = completed(calibration, old.rig, record, stayed or None)
@@ -225,9 +226,12 @@ def _drift(
         notes.append(f"only {', '.join(free)} was freed and judged: the rest counts as unchanged")
     # Lengths are compared where each side has metres of its own.
     scale_free = not (given.config.scale.measured and old.unit == "m")
+    tested = set(_tested(before, new.prior))
+    if old.unit is None:  # no lengths: it has its cameras in one place
+        tested = {(name, group) for name, group in tested if group != "translation"}
     record = judge(
         before, after, old.unit or "m", options,
-        scale_free=scale_free, tested=set(_tested(before, new.prior)),
+        scale_free=scale_free, tested=tested,
         cov_difference=new.cov_change, notes=notes,
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record

@@ -22,6 +22,7 @@ from synthetic.recalibrations import (
     written,
 )
 
+from graphs.camera import fit_lens
 from graphs.frames import Transform, log_rotation
 from graphs.propagation import lens_names, marginal, pose_names
 from sfm_calib import recalibrate as story
@@ -307,7 +308,10 @@ def test_a_scan_with_metres_of_its_own_judges_the_size() -> None:
 def test_an_old_calibration_without_metres_is_no_drift_of_the_size() -> None:
     drift = found("no metres").drift
     assert drift.verdict == "keep" and drift.scale_free and result("no metres").rig.metric
-    assert drift.notes == ("the two have no metric scale in common: the rig's size is not judged",)
+    assert "states no unit of length (--metres" in drift.notes[0]
+    assert drift.notes[1:] == (
+        "the two have no metric scale in common: the rig's size is not judged",
+    )
 
 
 @pytest.mark.slow
@@ -380,6 +384,48 @@ def test_what_rig_yaml_says_goes_before_the_old_calibration_and_is_said(
     assert any("cam1: k1 as rig.yaml has it" in one for one in calibration.verdict.messages)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["start", "weak"])
+def test_what_rig_yaml_holds_without_a_value_is_held_at_the_old_one(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    already_mapped(monkeypatch)
+    config = {"cameras": {"cam1": {"fixed": ["k2"]}}}
+    done = recalibrated(deployed(), tmp_path, pictures(("cam0", "cam1")), config=config, prior=mode)
+    calibration = done.outcome.calibration
+    assert calibration.cameras["cam1"].params["k2"] == deployed().cameras[1].named()["k2"]
+    assert done.drift.verdict == "keep" and calibration.verdict
+    assert "cam1: k2 held at the old" in calibration.verdict.messages[0]
+
+
+@pytest.mark.slow
+def test_an_old_calibration_with_no_lengths_is_judged_by_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    already_mapped(monkeypatch)
+    old = larger(replace(deployed(), covariance=NOTHING, unit="unknown"), 0.0)
+    drift = recalibrated(old, tmp_path).drift
+    assert drift.verdict == "keep"
+    assert not [test for test in drift.tests if test.group == "translation"]
+
+
+@pytest.mark.slow
+def test_a_scan_that_cannot_replace_what_does_not_hold_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lenses without distortion fit the pictures so badly that the result is not usable."""
+    already_mapped(monkeypatch)
+    old = replace(
+        deployed(), cameras=tuple(fit_lens(c, "pinhole")[0] for c in deployed().cameras),
+        covariance=NOTHING,
+    )  # fmt: skip
+    done = recalibrated(old, tmp_path, pictures(("cam0", "cam1")))
+    verdict = done.outcome.calibration.verdict
+    assert done.drift.verdict == "replace" and verdict and not verdict.usable
+    told = "the old calibration does not hold, but this scan cannot replace it: the sigma of cam0"
+    assert verdict.messages[0].startswith(told) and done.drift.lines[-1].startswith(told)
+
+
 @pytest.mark.parametrize(
     ("change", "config", "why"),
     [
@@ -402,14 +448,15 @@ def test_what_contradicts_the_old_calibration_is_refused(
     assert "\n" not in str(error.value)
 
 
-def test_a_camera_of_neither_size_nor_images_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    already_mapped(monkeypatch)
-    old = deployed()
+def test_a_camera_of_neither_size_nor_images_has_the_others_size_or_is_refused() -> None:
+    old, scan = deployed(), scan_of(("cam0", "cam1"))
     rig = replace(old, cameras=tuple(replace(c, size=NO_SIZE) for c in old.cameras))
+    told = story.old_calibration(rig, scan, (), story.DriftOptions())
+    assert [c.size for c in told.rig.cameras] == [(640, 480)] * 3
+    assert told.notes == ("images of cam2 are taken to be of 640 x 480 px, as the scan's",)
+    two_sizes = replace(scan, sizes=((640, 480), (320, 240)))
     with pytest.raises(CalibrationError, match="how large the images of cam2 are"):
-        story.old_calibration(rig, scan_of(("cam0", "cam1")), (), story.DriftOptions())
+        story.old_calibration(rig, two_sizes, (), story.DriftOptions())
 
 
 def scan_of(names: tuple[str, ...]) -> story.Scan:  # type: ignore[name-defined]
