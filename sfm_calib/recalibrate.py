@@ -21,6 +21,7 @@ from graphs.consider import completed as with_old_errors
 from graphs.consider import cov_difference, sensitivity
 from graphs.covariance import Covariance
 from graphs.drift_picture import Group, lens_columns
+from graphs.frames import Transform
 from graphs.ladder import Ladder
 from graphs.problem import PriorMode, PriorRig
 from graphs.propagation import lens_names, marginal, pose_names
@@ -227,7 +228,8 @@ def _drift(
     # Lengths are compared where each side has metres of its own.
     scale_free = not (given.config.scale.measured and old.unit == "m")
     tested = set(_tested(before, new.prior))
-    if old.unit is None:  # no lengths: it has its cameras in one place
+    if old.unit is None:  # its cameras are in one place: it says how they are turned
+        before, after = _without_lengths(before), _without_lengths(after)
         tested = {(name, group) for name, group in tested if group != "translation"}
     record = judge(
         before, after, old.unit or "m", options,
@@ -255,6 +257,14 @@ def _part(side: Stated, names: Sequence[str]) -> Stated:
     return Stated(
         estimate, marginal(side.covariance, of) if of else Covariance((), np.zeros((0, 0)))
     )
+
+
+def _without_lengths(side: Stated) -> Stated:
+    """With its cameras in one place, which is known."""
+    kept = [name for name in side.covariance.names if ".translation_" not in name]
+    placed = tuple(Transform(t.rotation, np.zeros(3)) for t in side.estimate.cam_from_rig)
+    known = marginal(side.covariance, kept) if kept else side.covariance
+    return Stated(replace(side.estimate, cam_from_rig=placed), known)
 
 
 def _tested(side: Stated, prior: PriorRig) -> Iterator[tuple[str, Group]]:
