@@ -83,10 +83,12 @@ def old_calibration(
     """
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
-    _check_sizes(rig)
+    rig, of_sizes = _sized(rig, scan)
     rig, unit = _in_unit(rig)
     least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
     rig, told = lifted(rig, least, options.old_sigma_px, options.range(unit or "m"))
+    if unit == "baseline" and read.unit == "unknown":
+        notes += (f"{rig.path} states no unit of length (--metres says what it is)",)
     assumed = not rig.states_sigmas
     if assumed:
         reference = rig.names.index(reference_of(rig))
@@ -95,7 +97,7 @@ def old_calibration(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
         rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
-    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *told))
+    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *of_sizes, *told))
 
 
 def _named_as(
@@ -124,14 +126,23 @@ def _named_as(
     return renamed(read, list(called.values())), notes
 
 
-def _check_sizes(rig: CameraRig) -> None:
-    """Raises CalibrationError for a camera without a size of its images, and without images."""
-    for camera in rig.cameras:
-        if camera.size == NO_SIZE:
-            raise CalibrationError(
-                f"{rig.path} does not say how large the images of {camera.name} are, and the scan "
-                "has none of it: add the size, or scan with that camera too"
-            )
+def _sized(rig: CameraRig, scan: Scan) -> tuple[CameraRig, tuple[str, ...]]:
+    """With the scan's image size, if it has but one, for cameras of neither size nor images.
+
+    Raises CalibrationError where it has several.
+    """
+    lost = [camera.name for camera in rig.cameras if camera.size == NO_SIZE]
+    if not lost:
+        return rig, ()
+    if len(set(scan.sizes)) > 1:
+        raise CalibrationError(
+            f"{rig.path} does not say how large the images of {lost[0]} are, and the scan has none "
+            "of it: add the size, or scan with that camera too"
+        )
+    size = scan.sizes[0]
+    cameras = tuple(replace(c, size=size) if c.name in lost else c for c in rig.cameras)
+    note = f"images of {', '.join(lost)} are taken to be of {size[0]} x {size[1]} px, as the scan's"
+    return replace(rig, cameras=cameras), (note,)
 
 
 def _in_unit(rig: CameraRig) -> tuple[CameraRig, Unit | None]:
