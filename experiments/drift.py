@@ -88,6 +88,7 @@ class Trial:
     detectable_px: float
     worst: str  # where that is
     power: float  # with which the sigmas let expect the change to be found by one test
+    nameable: bool  # the sigmas tell the camera from the others, by what is expected
 
     @property
     def named(self) -> bool:
@@ -150,30 +151,31 @@ def trial(case: Case, seed: int, criteria: Criteria) -> Trial:
 def tested(scan: Scanned, criteria: Criteria) -> Trial:
     """Ask whether the old calibration holds."""
     result = drift(scan.old, scan.new, criteria, n_frames=scan.n_frames)
-    power = 0.0 if scan.camera is None else expected_power(scan, criteria)
-    return told(result, scan.camera, power)
+    power, nameable = (0.0, False) if scan.camera is None else expected(scan, criteria)
+    return told(result, scan.camera, power, nameable)
 
 
-def expected_power(scan: Scanned, criteria: Criteria) -> float:
-    """Of the best single test, Holm's first, by the noncentrality that the true change has; by
+def expected(scan: Scanned, criteria: Criteria) -> tuple[float, bool]:
+    """Power, and whether the camera is named by the test of what is true, nothing drawn.
+
+    Power: of the best single test, Holm's first, by the noncentrality that the true change has; by
     sigmas alone and how well few frames tell them, whatever is allowed beside them."""
     by_sigma = replace(criteria, systematic_px=0.0)
     old, new = Stated(scan.true, scan.old.covariance), Stated(scan.now, scan.new.covariance)
-    tests = drift(old, new, by_sigma, n_frames=scan.n_frames).tests
-    return max(
-        float(rejecting(criteria.alpha / len(tests), test.dof, test.nu)(test.chi2))
-        for test in tests
-    )
+    result = drift(old, new, by_sigma, n_frames=scan.n_frames)
+    alpha = criteria.alpha / len(result.tests)
+    power = max(float(rejecting(alpha, t.dof, t.nu)(t.chi2)) for t in result.tests)
+    return power, result.drifted == (scan.camera,)
 
 
-def told(result: Drift, camera: int | None, power: float) -> Trial:
+def told(result: Drift, camera: int | None, power: float, nameable: bool) -> Trial:
     """The drift in the words that are counted; camera: that which changed, if any."""
     surest = min(result.tests, key=lambda test: test.p_value)
     worst = max(result.decisive, key=lambda test: test.detectable_px)
     return Trial(
         camera, result.verdict, result.drifted, result.moved, surest.p_corrected,
         f"{surest.group} {surest.cameras}", result.detectable_px, f"{worst.group} {worst.cameras}",
-        power,
+        power, nameable,
     )  # fmt: skip
 
 
@@ -215,6 +217,8 @@ class Summary:
     inconclusive: float
     named: float
     among: float
+    nameable: int  # trials whose sigmas let expect the camera to be named
+    named_nameable: float  # of these
     detectable_px: float  # median
     worst: str  # where it most often is
     found: str  # the test that most often is the surest
@@ -225,6 +229,7 @@ class Summary:
 def summarise(case: Case, trials: Sequence[Trial]) -> Summary:
     """Shares over all trials of a case."""
     allowed = [one for one in trials if one.power >= Criteria().power]
+    nameable = [one for one in allowed if one.nameable]
 
     def share(verdict: Verdict, of: Sequence[Trial] = trials) -> float:
         return float(np.mean([one.verdict == verdict for one in of])) if of else 0.0
@@ -238,6 +243,8 @@ def summarise(case: Case, trials: Sequence[Trial]) -> Summary:
         inconclusive=share("inconclusive"),
         named=float(np.mean([one.named for one in trials])),
         among=float(np.mean([one.among for one in trials])),
+        nameable=len(nameable),
+        named_nameable=float(np.mean([one.named for one in nameable])) if nameable else 0.0,
         detectable_px=float(np.median([one.detectable_px for one in trials])),
         worst=_commonest([one.worst for one in trials]),
         found=_commonest([one.found for one in trials]),
@@ -271,7 +278,8 @@ def overview(summaries: Sequence[Summary]) -> Table:
     table = Table(title=f"old calibrations right to {OLD_PX:g} px")
     for column in (
         "rig", "change", "trials", "replace", "keep", "inconclusive", "right camera\nnamed",
-        "or among\nthose named", "where sigmas\nallow it", "detectable\npx", "where", "surest test",
+        "or among\nthose named", "replace where\nsigmas allow it",
+        "named where\nthey do", "detectable\npx", "where", "surest test",
     ):  # fmt: skip
         table.add_column(column, justify="right")
     for s in summaries:
@@ -279,6 +287,7 @@ def overview(summaries: Sequence[Summary]) -> Table:
         table.add_row(
             s.rig, s.change, f"{s.trials}", *(f"{100 * share:.0f} %" for share in shares),
             f"{100 * s.replace_allowed:.0f} % of {s.allowed}" if s.allowed else "–",
+            f"{100 * s.named_nameable:.0f} % of {s.nameable}" if s.nameable else "–",
             f"{s.detectable_px:.2f}", s.worst, s.found,
         )  # fmt: skip
     return table

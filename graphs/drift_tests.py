@@ -27,8 +27,9 @@ AXES = ("x", "y", "z")
 DRAWS, SEED = 24, 0
 # Of the allowance in px, what a camera's place gets: lens models and shutters bend directions, and
 # none of the evidence is of lengths. With all of it, 15 of 39 simulated scans find that a baseline
-# of 0.2 m grew by 0.5 %, which sigmas let all of them find; with 0.75 of it 35, with half all 39.
-OF_PLACE = 0.5
+# of 0.2 m grew by 0.5 %, and 2 of 24 of three cameras, which sigmas let all of them find; with 0.75
+# of it 35 and 12, with half 39 and 22, with a quarter all.
+OF_PLACE = 0.25
 LEAST_BASELINE = 0.1  # of the other one: a baseline as short has no direction to keep
 
 
@@ -142,7 +143,8 @@ def changes(
         for group, columns in lens_columns(camera):
             if group not in freed[index]:
                 held += [names.index(lens_names(camera)[column]) for column in columns]
-    change, to_old = _apart(old.estimate, new.estimate)
+    change = _apart(old.estimate, new.estimate)
+    to_old = _carrying(old.estimate, new.estimate)
     between = new if cov_difference is None else Stated(new.estimate, cov_difference)
     parts = [to_old @ _as_twists(between, names) @ to_old.T + _curvature(between, old.estimate)]
     if cov_difference is None:
@@ -165,16 +167,25 @@ def changes(
     return Changes(old.estimate, pictures, freed, tuple(names), change, np.sum(parts, 0), guesses)
 
 
-def _apart(old: Estimate, new: Estimate) -> tuple[FloatArray, FloatArray]:
-    """The change (n,) of all lenses and left twists, and what carries the new one's to it."""
-    apart, carried = [], []
+def _apart(old: Estimate, new: Estimate) -> FloatArray:
+    """The change (n,) of all lenses and left twists."""
+    apart = []
     for index, (one, other) in enumerate(zip(old.cameras, new.cameras, strict=True)):
         a, b = (side.cam_from_rig[index] for side in (old, new))
         turn = b.rotation @ a.rotation.T
-        moved, carry = _polar(a.translation, turn.T @ b.translation)
+        moved = _polar(a.translation, turn.T @ b.translation)[0]
         apart += [other.params - one.params, log_rotation(turn), moved]
-        carried += [np.eye(len(one.names) + 3), carry @ turn.T]
-    return np.concatenate(apart), scipy.linalg.block_diag(*carried)
+    return np.concatenate(apart)
+
+
+def _carrying(old: Estimate, new: Estimate) -> FloatArray:
+    """What carries changes (n,) of the new one to the old: (n, n)."""
+    carried = []
+    for camera, a, b in zip(old.cameras, old.cam_from_rig, new.cam_from_rig, strict=True):
+        turn = b.rotation @ a.rotation.T
+        carry = _polar(a.translation, turn.T @ b.translation)[1]
+        carried += [np.eye(len(camera.names) + 3), carry @ turn.T]
+    return scipy.linalg.block_diag(*carried)
 
 
 def _curvature(side: Stated, other: Estimate) -> FloatArray:
@@ -183,13 +194,13 @@ def _curvature(side: Stated, other: Estimate) -> FloatArray:
     Of errors e and -e the mean is all curvature. Nothing where sigmas are small; of a scan that
     knows a baseline of 130 mm to 70 mm it is as large as the rest, without which it found drift.
     """
-    middle = _apart(other, side.estimate)[0]
+    middle = _apart(other, side.estimate)
     total = np.zeros((len(middle), len(middle)))
     rng = np.random.default_rng(SEED)
     for _ in range(DRAWS if side.covariance.names else 0):
         error = side.root @ rng.standard_normal(len(side.root))
         both = [
-            _apart(other, changed(side.estimate, side.covariance.names, sign * error))[0]
+            _apart(other, changed(side.estimate, side.covariance.names, sign * error))
             for sign in (1, -1)
         ]
         missed = (both[0] + both[1]) / 2 - middle
