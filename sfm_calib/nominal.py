@@ -31,14 +31,15 @@ RIG_LENS: LensName = "radtan"
 LONE_LENS: LensName = "radial"
 
 
-def lens_of(config: RigConfig, name: str, n_cameras: int) -> LensName:
-    """The camera's own lens, or the one of all, or the one that mapping starts with."""
+def lens_said(config: RigConfig, name: str) -> LensName | None:
+    """The camera's own lens, or the one of all; None: it is to be found."""
     said = camera_config(config, name).lens
-    if said is not None:
-        return said
-    if config.lens != "auto":
-        return config.lens
-    return RIG_LENS if n_cameras > 1 else LONE_LENS
+    return said if said is not None or config.lens == "auto" else config.lens
+
+
+def lens_of(config: RigConfig, name: str, n_cameras: int) -> LensName:
+    """As `lens_said`, or the one that mapping starts with."""
+    return lens_said(config, name) or (RIG_LENS if n_cameras > 1 else LONE_LENS)
 
 
 def on_ladder(config: RigConfig, names: Sequence[str]) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.images import Scan
 from sfm_calib.lifted import lifted
-from sfm_calib.nominal import LONE_LENS, RIG_LENS
+from sfm_calib.nominal import LONE_LENS, RIG_LENS, lens_said
 from sfm_calib.partial import reference_of, seen_from, stated_of
 from sfm_calib.prior import checked
 from sfm_calib.uncertainty import Unit
@@ -73,7 +73,11 @@ class OldCalibration:
 
 
 def old_calibration(
-    read: CameraRig, scan: Scan, cameras: Sequence[str], options: DriftOptions
+    read: CameraRig,
+    scan: Scan,
+    config: RigConfig,
+    cameras: Sequence[str],
+    options: DriftOptions,
 ) -> OldCalibration:
     """An old calibration as it was read, for a scan of its rig.
 
@@ -86,7 +90,8 @@ def old_calibration(
     rig, of_sizes = _sized(rig, scan)
     rig, unit = _in_unit(rig)
     least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
-    rig, told = lifted(rig, least, options.old_sigma_px, options.range(unit or "m"))
+    loose = [name for name in scan.cameras if lens_said(config, name) is None]
+    rig, told = lifted(rig, loose, least, options.old_sigma_px, options.range(unit or "m"))
     if unit == "baseline" and read.unit == "unknown":
         notes += (f"{rig.path} states no unit of length (--metres says what it is)",)
     assumed = not rig.states_sigmas

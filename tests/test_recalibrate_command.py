@@ -64,7 +64,7 @@ def test_the_verdict_is_the_exit_status_where_that_is_asked_for(
     assert run(old, scan, "-o", tmp_path / "out", "--exit-code") == 3
     printed = capsys.readouterr().out
     assert "verdict: Replace: cam1" in printed
-    assert "cam2: radial, 640 x 480 px, not in the scan: kept" in printed
+    assert "cam2: radtan, 640 x 480 px, not in the scan: kept" in printed
     unsure = ["--exit-code", "--matters-px", "0.01"]
     assert run(old, pictures(("cam2",)), "-o", tmp_path / "out", *unsure) == 4
     capsys.readouterr()

@@ -116,6 +116,25 @@ def test_what_rig_yaml_holds_without_a_value_is_held_at_the_old_one(
     assert "cam1: k2 held at the old" in calibration.verdict.messages[0]
 
 
+@pytest.mark.parametrize(
+    "config", [{}, {"lens": "radial"}, {"cameras": {"cam0": {"lens": "radial"}}}]
+)
+def test_lenses_too_simple_are_widened_but_of_kept_cameras_and_where_the_lens_is_said(
+    config: dict[str, object],
+) -> None:
+    old, said = deployed(), story.RigConfig.model_validate(config)
+    simple = replace(old, cameras=tuple(fit_lens(c, "radial")[0] for c in old.cameras),
+                     covariance=NOTHING)  # fmt: skip
+    scan = scan_of(("cam0", "cam1"))
+    told = story.old_calibration(simple, scan, said, (), story.DriftOptions())
+    first = "radial" if config else "radtan"
+    second = "radial" if "lens" in config else "radtan"
+    assert [c.lens for c in told.rig.cameras] == [first, second, "radial"]
+    assert len(told.notes) == [first, second].count("radtan")
+    lenses = story.with_lenses(said, told.rig, scan.cameras).cameras
+    assert [lenses[name].lens for name in scan.cameras] == [first, second]
+
+
 @pytest.mark.slow
 def test_an_old_calibration_with_no_lengths_is_judged_by_what_it_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -137,7 +156,8 @@ def test_a_scan_that_cannot_replace_what_does_not_hold_says_so(
         deployed(), cameras=tuple(fit_lens(c, "pinhole")[0] for c in deployed().cameras),
         covariance=NOTHING,
     )  # fmt: skip
-    done = recalibrated(old, tmp_path, pictures(("cam0", "cam1")))
+    scan = pictures(("cam0", "cam1"))
+    done = recalibrated(old, tmp_path, scan, config={"lens": "pinhole"})
     verdict = done.outcome.calibration.verdict
     assert done.drift.verdict == "replace" and verdict and not verdict.usable
     told = "the old calibration does not hold, but this scan cannot replace it: the sigma of cam0"
@@ -147,7 +167,7 @@ def test_a_scan_that_cannot_replace_what_does_not_hold_says_so(
 @pytest.mark.parametrize(
     ("change", "config", "why"),
     [
-        ({}, {"lens": "brown"}, "^--lens brown: .* has cam0 in the lens radial"),
+        ({}, {"lens": "brown"}, "^--lens brown: .* has cam0 in the lens radtan"),
         ({}, {"cameras": {"cam1": {"lens": "brown"}}}, "rig.yaml gives cam1 the lens brown"),
         ({"size": (320, 240)}, {}, r"images of 640 x 480 px, and .* 320 x 240 px"),
         ({"name": "left"}, {"reference": "cam0"}, r"--reference cam0: .* has no such camera"),
@@ -169,19 +189,21 @@ def test_what_contradicts_the_old_calibration_is_refused(
 def test_a_camera_of_neither_size_nor_images_has_the_others_size_or_is_refused() -> None:
     old, scan = deployed(), scan_of(("cam0", "cam1"))
     rig = replace(old, cameras=tuple(replace(c, size=NO_SIZE) for c in old.cameras))
-    told = story.old_calibration(rig, scan, (), story.DriftOptions())
+    told = story.old_calibration(rig, scan, story.RigConfig(), (), story.DriftOptions())
     assert [c.size for c in told.rig.cameras] == [(640, 480)] * 3
     assert told.notes == ("images of cam2 are taken to be of 640 x 480 px, as the scan's",)
     two_sizes = replace(scan, sizes=((640, 480), (320, 240)))
     with pytest.raises(CalibrationError, match="how large the images of cam2 are"):
-        story.old_calibration(rig, two_sizes, (), story.DriftOptions())
+        story.old_calibration(rig, two_sizes, story.RigConfig(), (), story.DriftOptions())
 
 
 # ---- cameras called otherwise ----------------------------------------------------------------
 
 
 def old_of(names: tuple[str, ...], *cameras: str) -> story.OldCalibration:
-    return story.old_calibration(deployed(), scan_of(names), cameras, story.DriftOptions())
+    return story.old_calibration(
+        deployed(), scan_of(names), story.RigConfig(), cameras, story.DriftOptions()
+    )
 
 
 def test_cameras_are_matched_as_told_or_by_order() -> None:

@@ -29,7 +29,9 @@ from synthetic.earlier import NAMES, TRACKS, scan, solved
 from synthetic.scans import blank, silent
 
 SIGMA_PX = 0.04  # fine enough for `keep` from a dozen frames
-SCAN = TRACKS.model_copy(update={"sigma_px": SIGMA_PX, "points": 500, "max_points_per_image": 45})
+SCAN = TRACKS.model_copy(
+    update={"lens": "radtan", "sigma_px": SIGMA_PX, "points": 500, "max_points_per_image": 45}
+)
 QUICKLY = DriftOptions(depth_ranges=())  # depths take a fifth of a run
 MAPPED_UNIT = 1.3  # of the mapping's lengths in metres: nothing may hang on it
 
