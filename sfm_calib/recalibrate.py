@@ -124,7 +124,7 @@ def recalibrate(
     if options.metres is not None:
         read = read.metric(options.metres)
     scan = checked_scan(scan_path, config, cache, progress, watch)
-    old = old_calibration(read, scan, options.cameras, drift)
+    old = old_calibration(read, scan, options.cameras, drift, config.lens)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
     with watch.stage("tracks and mapping"):
