@@ -82,19 +82,26 @@ def old_calibration(
     """An old calibration as it was read, for a scan of its rig.
 
     cameras: `name in OLD=name in the scan`, where the names do not tell. options: how right a file
-    without sigmas is taken to be. Raises CalibrationError where no camera is in both, where image
-    sizes differ or nothing tells them, and where it does not say how its cameras sit.
+    without sigmas is taken to be. A lens that the configuration gives is taken where it holds the
+    old one; where it gives none, a richer one in place of one too simple for a scan. Raises
+    CalibrationError where no camera is in both, where image sizes differ or nothing tells them, and
+    where it does not say how its cameras sit.
     """
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
     rig, of_sizes = _sized(rig, scan)
     rig, unit = _in_unit(rig)
-    least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
-    loose = [name for name in scan.cameras if lens_said(config, name) is None]
-    rig, told = lifted(rig, loose, least, options.old_sigma_px, options.range(unit or "m"))
     if unit == "baseline" and read.unit == "unknown":
         notes += (f"{rig.path} states no unit of length (--metres says what it is)",)
     assumed = not rig.states_sigmas
+    for name in scan.cameras:
+        wanted = lens_said(config, name)
+        if wanted is None and assumed:  # who states sigmas has chosen the lens on evidence
+            wanted = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
+        if wanted is not None:
+            distance = options.range(unit or "m")
+            rig, told = lifted(rig, wanted, (name,), options.old_sigma_px, distance)
+            notes += told
     if assumed:
         reference = rig.names.index(reference_of(rig))
         side = seen_from(stated_of(rig), rig.names[reference])
@@ -102,7 +109,7 @@ def old_calibration(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
         rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
-    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *of_sizes, *told))
+    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *of_sizes))
 
 
 def _named_as(

@@ -19,7 +19,7 @@ from graphs.frames import FloatArray, Transform, exp_rotation
 from graphs.pose_covariance import poses_as, rereferenced
 from graphs.problem import Estimate
 from graphs.propagation import marginal
-from graphs.significance import degrees, detectable, holm, noncentrality, significance
+from graphs.significance import Guess, degrees, detectable, holm, noncentrality, significance
 from sfm_calib.simulate.rigs import RigName, make_rig
 
 EXACT = Criteria(systematic_px=0.0, depth_ranges=())
@@ -134,10 +134,14 @@ def test_many_frames_are_as_good_as_a_known_covariance() -> None:
 
 
 def test_what_is_known_beside_a_guess_makes_it_matter_less() -> None:
-    assert degrees(np.eye(3), 0.5 * np.eye(3), 10) == pytest.approx(40)
-    assert degrees(np.eye(3), np.diag([0.5, 1.0, 0.0]), 10) == pytest.approx(10)
-    assert degrees(np.eye(3), np.zeros((3, 3)), 10) == np.inf
-    assert degrees(np.eye(3), np.eye(3), np.inf) == np.inf
+    half, whole = Guess(0.5 * np.eye(3), 10), Guess(np.eye(3), 10)
+    assert degrees(np.eye(3), [half]) == pytest.approx(40)
+    assert degrees(np.eye(3), [Guess(np.diag([0.5, 1.0, 0.0]), 10)]) == pytest.approx(10)
+    assert degrees(np.eye(3), [Guess(np.zeros((3, 3)), 10)]) == np.inf
+    assert degrees(np.eye(3), [replace(whole, nu=np.inf)]) == np.inf
+    # Two halves of many and of few: the few count.
+    assert degrees(np.eye(3), [half, replace(half, nu=90)]) == pytest.approx(36)
+    assert degrees(np.eye(3), []) == np.inf
 
 
 def test_an_assumed_covariance_errs_by_what_is_assumed() -> None:

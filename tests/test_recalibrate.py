@@ -95,7 +95,7 @@ def test_an_old_calibration_that_holds_is_kept(mode: str) -> None:
     assert (record.kept, record.added, record.freed) == ((), (), ("all",))
     assert calibration.verdict and calibration.verdict.messages == ()
     assert np.sqrt(np.mean(np.square(in_sigmas(calibration)))) < 2
-    names = {n for c in deployed().cameras for n in lens_names(c)}
+    names = {n for c in calibration.cameras for n in lens_names(calibration.camera(c))}
     names |= {n for c in NAMES[1:] for n in pose_names(c)}
     assert set(record.contributions) == names
     shares = [one.prior_share for one in record.contributions.values()]

@@ -167,8 +167,8 @@ def test_a_scan_that_cannot_replace_what_does_not_hold_says_so(
 @pytest.mark.parametrize(
     ("change", "config", "why"),
     [
-        ({}, {"lens": "brown"}, "^--lens brown: .* has cam0 in the lens radtan"),
-        ({}, {"cameras": {"cam1": {"lens": "brown"}}}, "rig.yaml gives cam1 the lens brown"),
+        ({}, {"lens": "eucm"}, "^--lens eucm: .* has cam0 in the lens radtan"),
+        ({}, {"cameras": {"cam1": {"lens": "eucm"}}}, "rig.yaml gives cam1 the lens eucm"),
         ({"size": (320, 240)}, {}, r"images of 640 x 480 px, and .* 320 x 240 px"),
         ({"name": "left"}, {"reference": "cam0"}, r"--reference cam0: .* has no such camera"),
     ],
