@@ -4,9 +4,11 @@ Question: a rig was calibrated; later it may have been touched. Does the drift t
 calibration and one ordinary scan, say keep, replace and inconclusive rightly, and name the camera?
 Method: simulated rigs; the old calibration errs as its sigmas say; one camera, any of them, is
 changed; a scan of the changed rig is solved as `sfm-calib calibrate` solves it, weak priors
-centred where it centres them, and tested with the stated covariances. Expectation: no drift, not
-more than 5 % replaced; drift, 95 %, and of three or more cameras the right one named; a scan too
-weak to tell, inconclusive.
+centred where it centres them, and tested with the stated covariances. Too weak to tell are scans
+of few frames and much noise (weak, and one camera turned: weak turned), and of a walk that only
+turns (panorama). Expectation: no drift, not more than 5 % replaced; drift, 95 % where the sigmas
+allow it, whatever is allowed beside them, and of three or more cameras the right one named where
+they do; a scan too weak to tell, inconclusive.
 Run: python -m experiments.drift [--trials N] [--only none turned ...] [--out FILE]
 """
 

@@ -122,3 +122,16 @@ def test_verdicts_have_exit_statuses_of_their_own() -> None:
 def test_impossible_options_are_refused(given: dict[str, float], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         DriftOptions(**given)  # type: ignore[arg-type]
+
+
+def test_few_frames_are_told_in_the_record() -> None:
+    side = rig("triple")
+    new = drawn(side, np.random.default_rng(6))
+    many, few = (judge(side, new, "m", n_frames=n).record for n in (None, 6))
+    assert {test.nu for test in many.tests} == {None}
+    for one, other in zip(many.tests, few.tests, strict=True):
+        assert other.nu is not None
+        assert other.nu >= 5
+        assert other.p_value != one.p_value
+        assert other.detectable_px > one.detectable_px
+    assert DriftRecord.model_validate_json(few.model_dump_json()) == few
