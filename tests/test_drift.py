@@ -438,6 +438,17 @@ def test_so_much_is_allowed_as_is_said() -> None:
     assert place_px == pytest.approx(OF_PLACE * of_both, rel=0.2)
 
 
+def test_sigmas_of_a_camera_that_turned_far_are_along_its_old_axes() -> None:
+    """Known badly along x as it was, which is y as it is after a quarter turn about z."""
+    side = rig("stereo")
+    exact = Stated(side.estimate, Covariance((), np.zeros((0, 0))))
+    quarter = turned(exact, 1, 90.0, axis=2)
+    names = tuple(f"cam1.translation_{axis}" for axis in "xyz")
+    new = Stated(quarter.estimate, Covariance(names, np.diag([0.0, 1e-8, 0.0])))
+    row = test_of(drift(exact, new, EXACT), (0, 1), "translation")
+    assert np.allclose(row.sigma, [1e-4, 0.0, 0.0], atol=1e-6)
+
+
 def test_what_bends_is_expected_to_err_by_more_than_its_derivatives_say() -> None:
     """Of a baseline of 0.2 m known to 0.1 m, errors leave its length and direction together."""
     side = rig("stereo")
