@@ -28,6 +28,7 @@ from graphs.propagation import lens_names, marginal, pose_names
 from graphs.refine import Refinement
 from graphs.split_check import SplitCheck
 from graphs.stated_covariance import CalibrationCovariance
+from graphs.twin import Certificate
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import (
     Outcome,
@@ -131,34 +132,43 @@ def recalibrate(
         mapped = map_with_prior(scan, old.rig, config, cache, progress)
     given = Given(scan, config, mapped, command)
     with enough_placed(mapped.problem, len(scan.images)):
-        careful: PriorMode = "start" if options.prior == "start" else "weak"
-        alone = _solve(given, old, careful, options.free, scan.cameras, watch, progress)
-        with watch.stage("drift"), refusals():
-            found = _drift(given, old, alone, drift, options.free)
-        stayed = _unmoved(found, config.reference)
-        best = alone
-        if options.prior == "full" and found.verdict != "replace":
-            best = _solve(given, old, "full", options.free, scan.cameras, watch, progress, alone)
-        elif alone.baseline and len(stayed) > 1 and not set(alone.baseline.cameras) <= set(stayed):
-            best = _solve(given, old, careful, options.free, stayed, watch, progress, alone)
+        judged = _judged(given, old, options, drift, watch, progress)
     with watch.stage("certificate"):
-        certificate = certificate_of(best.refinement, config, progress)
-    run = Run(
-        scan, config, mapped, best.refinement, best.covariance, watch.seconds, command,
-        best.ladder, best.split, certificate,
-    )  # fmt: skip
-    calibration, unit = summarise(run)
-    found = doubted(found, calibration.verdict)
-    calibration = _told(calibration, old, config, options, best, found, stayed)
-    record = Recalibration(old=replaces, prior=best.prior.mode, freed=options.free, drift=found)
-    whole = completed(calibration, old.rig, record, stayed or None)
-    by = _size(whole) / _size(calibration)
-    contributions = contributions_of(
-        best.prior, best.side.scaled(by), alone.side.scaled(by), best.covariance.model,
-        whole.rig.metric,
-    )  # fmt: skip
-    whole = _recorded(whole, contributions, replaces)
-    return Recalibrated(Outcome(whole, best.refinement, unit * by), found)
+        certificate = certificate_of(judged.best.refinement, config, progress)
+    return _result(given, old, options, judged, certificate, watch.seconds, replaces)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The scan's own optimum, what it says of the old calibration, and the optimum to hand out."""
+
+    alone: Solved
+    best: Solved
+    drift: DriftRecord
+    stayed: tuple[str, ...]  # cameras that kept their places, where it is known which moved
+
+
+def _judged(
+    given: Given,
+    old: OldCalibration,
+    options: RecalibrateOptions,
+    drift: DriftOptions,
+    watch: Stopwatch,
+    progress: Progress,
+) -> Judged:
+    """Solve a scan by itself, test the old calibration, and solve with what of it still holds."""
+    cameras, reference = given.scan.cameras, given.config.reference
+    careful: PriorMode = "start" if options.prior == "start" else "weak"
+    alone = _solve(given, old, careful, options.free, cameras, watch, progress)
+    with watch.stage("drift"), refusals():
+        found = _drift(given, old, alone, drift, options.free)
+    stayed = _unmoved(found, reference)
+    best = alone
+    if options.prior == "full" and found.verdict != "replace":
+        best = _solve(given, old, "full", options.free, cameras, watch, progress, alone)
+    elif alone.baseline and len(stayed) > 1 and not set(alone.baseline.cameras) <= set(stayed):
+        best = _solve(given, old, careful, options.free, stayed, watch, progress, alone)
+    return Judged(alone, best, found, stayed)
 
 
 def _with_reference(config: RigConfig, old: OldCalibration, names: Sequence[str]) -> RigConfig:
@@ -299,6 +309,35 @@ def _unmoved(found: DriftRecord, reference: str | None) -> tuple[str, ...]:
 
 
 # ---- the result ----------------------------------------------------------------------------
+
+
+def _result(
+    given: Given,
+    old: OldCalibration,
+    options: RecalibrateOptions,
+    judged: Judged,
+    certificate: Certificate | None,
+    seconds: dict[str, float],
+    replaces: OldFile,
+) -> Recalibrated:
+    """All cameras of the rig, and what became of the old calibration."""
+    best = judged.best
+    run = Run(
+        given.scan, given.config, given.mapped, best.refinement, best.covariance, seconds,
+        given.command, best.ladder, best.split, certificate,
+    )  # fmt: skip
+    calibration, unit = summarise(run)
+    found = doubted(judged.drift, calibration.verdict)
+    calibration = _told(calibration, old, given.config, options, best, found, judged.stayed)
+    record = Recalibration(old=replaces, prior=best.prior.mode, freed=options.free, drift=found)
+    whole = completed(calibration, old.rig, record, judged.stayed or None)
+    by = _size(whole) / _size(calibration)
+    contributions = contributions_of(
+        best.prior, best.side.scaled(by), judged.alone.side.scaled(by), best.covariance.model,
+        whole.rig.metric,
+    )  # fmt: skip
+    whole = _recorded(whole, contributions, replaces)
+    return Recalibrated(Outcome(whole, best.refinement, unit * by), found)
 
 
 def _replaced(read: CameraRig) -> OldFile:
