@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -100,6 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sfm-calib {sfm_calib.__version__}")
         return 0
     quiet_decoders()
+    end_as_interrupted()
     try:
         return run(parse(arguments), arguments)
     except CalibrationError as error:
@@ -123,6 +126,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def flag(option: str) -> str:
     """How an option is called on the command line."""
     return f"--{option.replace('_', '-')}"
+
+
+def end_as_interrupted() -> None:
+    """SIGTERM (`kill`, `timeout`, a service that stops) ends us as Ctrl-C does: by itself, glog,
+    which pycolmap loads, would print a C++ stack trace."""
+    if threading.current_thread() is threading.main_thread():  # no other may set handlers
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def quiet_decoders() -> None:

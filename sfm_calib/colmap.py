@@ -236,7 +236,7 @@ def constrain_rig(
             rotation = pycolmap.Rotation3d(transform.rotation)
             camera.cam_from_rig = pycolmap.Rigid3d(rotation, transform.translation)
         cameras.append(camera)
-    rig.cameras = cameras
+    rig.cameras = sorted(cameras, key=lambda camera: not camera.ref_sensor)  # wanted first
     with pycolmap.Database.open(database) as db:
         pycolmap.apply_rig_config([rig], db)
 

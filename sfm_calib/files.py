@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
@@ -13,6 +14,7 @@ from typing import Final
 from sfm_calib.errors import CalibrationError
 
 RESULT_FILE: Final = "calibration.json"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 # Files that formats of calibrations have; a folder's others (pictures, reports) are none of it.
 CALIBRATION_SUFFIXES = (
     ".json", ".yaml", ".yml", ".xml", ".toml", ".txt", ".bin", ".cameramodel",
@@ -36,10 +38,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except OSError as error:
-        raise CalibrationError(
-            f"cannot write {path}: {error.strerror or error}; free some space or choose another "
-            "output folder"
-        ) from error
+        raise CalibrationError(f"cannot write {path}: {_trouble(error)}") from error
     finally:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
@@ -79,13 +78,16 @@ def write_folder_atomically(folder: Path, files: Mapping[str, bytes]) -> None:
                 old.rename(folder)
             raise
     except OSError as error:
-        raise CalibrationError(
-            f"cannot write {folder}: {error.strerror or error}; free some space or choose another "
-            "output folder"
-        ) from error
+        raise CalibrationError(f"cannot write {folder}: {_trouble(error)}") from error
     finally:
         if temporary:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _trouble(error: OSError) -> str:
+    """Why a file could not be written, and what to do about it: room helps a full disk alone."""
+    remedy = "free some space or choose" if error.errno in DISK_FULL else "choose"
+    return f"{error.strerror or error}; {remedy} another output folder"
 
 
 def read_text(path: Path, remedy: str, encoding: str = "utf-8") -> str:

@@ -134,7 +134,11 @@ def _named_as(
         notes = (f"cameras are called otherwise in the scan: matched by their order, {said}",)
     if len(set(called.values())) < len(called):
         twice = next(n for n in called.values() if list(called.values()).count(n) > 1)
-        raise CalibrationError(f"--cameras {' '.join(wanted)}: two cameras of OLD are {twice}")
+        both = " and ".join(old for old, new in called.items() if new == twice)
+        raise CalibrationError(
+            f"--cameras {' '.join(wanted)}: two cameras of OLD are {twice} of the scan, {both}: "
+            "say of each which it is (those not named keep their names)"
+        )
     return renamed(read, list(called.values())), notes
 
 

@@ -128,6 +128,8 @@ def recalibrate(
     old = old_calibration(read, scan, config, options.cameras, drift)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
+    # What it refuses (a wrong word of --free) is refused before the minutes that mapping takes.
+    _prior_of(old, "start", options.free, scan.cameras, config)
     with watch.stage("tracks and mapping"):
         mapped = map_with_prior(scan, old.rig, config, cache, progress)
     given = Given(scan, config, mapped, command)
@@ -181,6 +183,17 @@ def _with_reference(config: RigConfig, old: OldCalibration, names: Sequence[str]
     return config.model_copy(update={"reference": config.reference or old.reference(names)})
 
 
+def _prior_of(
+    old: OldCalibration,
+    mode: PriorMode,
+    free: Sequence[str],
+    names: Sequence[str],
+    config: RigConfig,
+) -> PriorRig:
+    assert config.reference is not None
+    return prior_of(old.rig, mode, free, names, config.reference)
+
+
 def _solve(
     given: Given,
     old: OldCalibration,
@@ -196,8 +209,7 @@ def _solve(
     measured: cameras whose old distance may give the metres. before: a first one.
     """
     scan, config = given.scan, given.config
-    assert config.reference is not None
-    prior = prior_of(old.rig, mode, free, scan.cameras, config.reference)
+    prior = _prior_of(old, mode, free, scan.cameras, config)
     baseline = None
     if not prior.gives_scale and not config.scale.measured:
         baseline = old.baseline(measured)

@@ -114,7 +114,8 @@ def _cause_of_death(code: int, log: list[str]) -> BaseException:
 
 def _work(channel: int) -> None:
     """The worker's side: read the job, do it, and say how it ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started us is told too, and ends us
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, signal.SIG_IGN)  # whoever started us is told too, and ends us
     work, arguments, verbose = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     colmap.quiet(verbose)

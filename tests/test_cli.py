@@ -171,6 +171,16 @@ def test_an_interrupt_is_no_traceback(capsys, monkeypatch):
     assert capsys.readouterr().err.startswith("sfm-calib: interrupted")
 
 
+def test_being_told_to_end_is_an_interrupt(capsys, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(cli, "run", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        assert main(["demo"]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err.startswith("sfm-calib: interrupted")
+
+
 def heed_interrupts():
     """A background job is born deaf to Ctrl-C, and so are its children."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

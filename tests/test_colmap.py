@@ -10,11 +10,12 @@ from synthetic.cameras import camera_of
 from synthetic.scans import simulation
 
 from graphs.camera import project, unproject
+from graphs.frames import Transform
 from graphs.lenses import LENS_NAMES, PARAMETER_NAMES
 from sfm_calib import colmap
 from sfm_calib.cache import Cache
 from sfm_calib.colmap_lenses import EXACT_MODEL, LENS_OF_MODEL, MAPPING_MODEL
-from sfm_calib.images import read_scan
+from sfm_calib.images import Scan, ScanImage, read_scan
 from sfm_calib.mapping_attempts import attempts
 
 
@@ -49,6 +50,26 @@ def test_tracks_and_models_are_the_same_every_time(tmp_path):
     np.testing.assert_array_equal(model.observations.pixels, model_again.observations.pixels)
     for ours, others in zip(model.cameras, model_again.cameras, strict=True):
         np.testing.assert_array_equal(ours.params, others.params)
+
+
+@pytest.mark.parametrize("reference", [0, 1])
+def test_any_camera_can_be_the_rigs_reference(reference, tmp_path):
+    database, images = tmp_path / "database.db", []
+    with pycolmap.Database.open(database) as db:
+        for index, name in enumerate("ab"):
+            camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24])
+            number = db.write_camera(camera)
+            for frame in range(2):
+                image = ScanImage(index, frame, f"{name}/{frame}.png")
+                images.append(image)
+                db.write_image(pycolmap.Image(name=image.path, camera_id=number))
+    scan = Scan(tmp_path, ("a", "b"), ((64, 48),) * 2, ("0", "1"), tuple(images))
+    places = [Transform.identity(), Transform.exp(np.array([0.1, 0.2, 0.3]), np.array([1, 2, 3]))]
+    own = places[reference].inverse
+    colmap.constrain_rig(scan, [place @ own for place in places], reference, database)
+    with pycolmap.Database.open(database) as db:
+        (rig,) = db.read_all_rigs()
+    assert rig.num_sensors() == 2 and rig.ref_sensor_id.id == reference + 1
 
 
 def grid():

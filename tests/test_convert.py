@@ -138,7 +138,7 @@ def test_coefficients_that_are_zero_may_go(tmp_path: Path) -> None:
     assert "which is the same" in exported(plain, "kalibr").notes[0]
     message = refusal(brown, "kalibr")
     assert "Kalibr camchain has no brown lens" in message and "its radtan is nearest" in message
-    assert "rms" in message and "--max-error-px 0.1" in message
+    assert "rms" in message and "convert --max-error-px 0.1" in message
     assert "refitted as radtan, off by" in exported(brown, "kalibr", 5.0).notes[0]
 
 

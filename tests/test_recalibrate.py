@@ -172,7 +172,10 @@ def test_a_lens_that_is_freed_alone_is_found_changed() -> None:
 def test_words_that_free_nothing_are_refused(
     word: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    already_mapped(monkeypatch)
+    def too_late(*_: object) -> None:
+        pytest.fail("mapping takes minutes: a wrong word is to be refused before it")
+
+    monkeypatch.setattr(story, "map_with_prior", too_late)
     with pytest.raises(CalibrationError, match=why):
         recalibrated(deployed(), tmp_path, free=(word,))
     with pytest.raises(ValueError, match="at least 1"):

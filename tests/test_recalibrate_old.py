@@ -222,7 +222,11 @@ def test_cameras_are_matched_as_told_or_by_order() -> None:
         (("a", "b"), ("cam0",), "--cameras cam0: say NAME"),
         (("a", "b"), ("cam0=q",), "the scan has no camera 'q'"),
         (("a", "b"), ("q=a",), "calibration has no camera 'q'|has no camera 'q'"),
-        (("cam0", "cam1"), ("cam0=cam1",), "two cameras of OLD are cam1"),
+        (
+            ("cam0", "cam1"),
+            ("cam0=cam1",),
+            "two cameras of OLD are cam1 of the scan, cam0 and cam1: say",
+        ),
     ],
 )
 def test_names_that_do_not_match_are_refused(

@@ -135,7 +135,7 @@ def _held(rig: CameraRig, camera: Camera, form: Format, max_error_px: float) -> 
             nearest = (
                 f"its {fit.lens} is nearest, {rms:.2g} px rms and {largest:.2g} px off at worst"
             )
-            remedy = f"allow more than --max-error-px {max_error_px:g}, or "
+            remedy = f"allow more than `convert --max-error-px {max_error_px:g}`, or "
         raise CalibrationError(
             f"{form.title} has no {camera.lens} lens, and for {camera.name} of {rig.path} "
             f"{nearest}: {remedy}choose another format"
