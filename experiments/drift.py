@@ -20,18 +20,16 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy import stats
 
 from graphs.build import GraphOptions
 from graphs.compare import Stated
 from graphs.compare_chance import changed
-from graphs.covariance import Covariance
 from graphs.drift import Drift, Verdict, drift
 from graphs.drift_picture import assumed_covariance
 from graphs.drift_tests import Criteria
@@ -40,13 +38,15 @@ from graphs.losses import SCALE_95
 from graphs.priors import weak_lens_prior
 from graphs.problem import Estimate
 from graphs.refine import refine
+from graphs.significance import rejecting
 from graphs.stated_covariance import calibration_covariance
 from sfm_calib.files import write_atomically
 from sfm_calib.simulate.rigs import RigName, SimulatedRig, make_rig
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
-Change = Literal["none", "turned", "focal", "baseline", "weak"]
-CHANGES: tuple[Change, ...] = ("none", "turned", "focal", "baseline", "weak")
+Change = Literal["none", "turned", "focal", "baseline", "weak", "weak turned", "panorama"]
+CHANGES: tuple[Change, ...] = get_args(Change)
+UNTOUCHED: tuple[Change, ...] = ("none", "weak", "panorama")
 RIGS: tuple[RigName, ...] = ("stereo", "triple", "quad")
 
 TRIALS = 100
@@ -55,7 +55,7 @@ OLD_PX = 0.05  # what the old calibration is right to in the picture: boards rea
 MIN_PARALLAX_DEG = 1.0  # as rig.yaml has it
 # The baseline is measured to 0.05 %: a change by 0.5 % is then ten sigmas of the scale.
 SCAN = TrackOptions(
-    points=3000, max_points_per_image=250, frames=40, lens="radial", baseline_sigma_m=0.0001
+    points=1500, max_points_per_image=120, frames=40, lens="radial", baseline_sigma_m=0.0001
 )
 WEAK = {"frames": 8, "points": 600, "max_points_per_image": 50, "sigma_px": 1.0}
 TRAJECTORY = {"stereo": "orbit", "triple": "handheld", "quad": "handheld"}
@@ -70,8 +70,9 @@ class Case:
 
     @property
     def options(self) -> TrackOptions:
-        weak = WEAK if self.change == "weak" else {}
-        return SCAN.model_copy(update={"rig": self.rig, "trajectory": TRAJECTORY[self.rig], **weak})
+        weak = WEAK if self.change.startswith("weak") else {}
+        walk = "panorama" if self.change == "panorama" else TRAJECTORY[self.rig]
+        return SCAN.model_copy(update={"rig": self.rig, "trajectory": walk, **weak})
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ class Trial:
     detectable_px: float
     worst: str  # where that is
     power: float  # with which the sigmas let expect the change to be found by one test
+    nameable: bool  # the sigmas tell the camera from the others, by what is expected
 
     @property
     def named(self) -> bool:
@@ -102,12 +104,24 @@ class Trial:
 # ---- one scan ------------------------------------------------------------------------------
 
 
-def trial(case: Case, seed: int, criteria: Criteria) -> Trial:
-    """Calibrate a rig, change it, scan it, and ask whether the old calibration holds."""
+@dataclass(frozen=True)
+class Scanned:
+    """A rig calibrated, changed and scanned: what the test is asked, and what is true."""
+
+    true: Estimate  # when it was calibrated
+    now: Estimate
+    camera: int | None  # that was changed
+    old: Stated
+    new: Stated
+    n_frames: int
+
+
+def scanned(case: Case, seed: int) -> Scanned:
+    """Calibrate a rig, change it and scan it."""
     rng = np.random.default_rng([seed, RIGS.index(case.rig), CHANGES.index(case.change)])
     rig = make_rig(case.rig, SCAN.lens)
     true = Estimate(rig.cameras, rig.cam_from_rig, (), np.zeros((0, 3)))
-    cov = assumed_covariance(true, OLD_PX, criteria.range)
+    cov = assumed_covariance(true, OLD_PX, Criteria().range)
     error = Stated(true, cov).root @ rng.standard_normal(len(cov.names))
     old = Stated(changed(true, cov.names, error), cov)
     camera = int(rng.integers(len(rig.cameras)))
@@ -119,32 +133,49 @@ def trial(case: Case, seed: int, criteria: Criteria) -> Trial:
     covariance = calibration_covariance(
         found.graph, found.estimate, found.values, MIN_PARALLAX_DEG
     ).stated
-    result = drift(old, Stated(found.estimate, covariance), criteria)
-    untouched = case.change in ("none", "weak")
-    power = 0.0 if untouched else expected_power(true, cov, now, covariance, criteria)
-    return told(result, None if untouched else camera, power)
-
-
-def expected_power(
-    true: Estimate, cov_old: Covariance, now: SimulatedRig, cov_new: Covariance, criteria: Criteria
-) -> float:
-    """Of the best single test, Holm's first, by the noncentrality that the true change has."""
-    changed_rig = replace(true, cameras=now.cameras, cam_from_rig=now.cam_from_rig)
-    tests = drift(Stated(true, cov_old), Stated(changed_rig, cov_new), criteria).tests
-    return max(
-        float(stats.ncx2.sf(stats.chi2.isf(criteria.alpha / len(tests), t.dof), t.dof, t.chi2))
-        for t in tests
+    return Scanned(
+        true,
+        replace(true, cameras=now.cameras, cam_from_rig=now.cam_from_rig),
+        None if case.change in UNTOUCHED else camera,
+        old,
+        Stated(found.estimate, covariance),
+        len(found.problem.frame_names),
     )
 
 
-def told(result: Drift, camera: int | None, power: float) -> Trial:
+def trial(case: Case, seed: int, criteria: Criteria) -> Trial:
+    """Ask it of one scan of a case."""
+    return tested(scanned(case, seed), criteria)
+
+
+def tested(scan: Scanned, criteria: Criteria) -> Trial:
+    """Ask whether the old calibration holds."""
+    result = drift(scan.old, scan.new, criteria, n_frames=scan.n_frames)
+    power, nameable = (0.0, False) if scan.camera is None else expected(scan, criteria)
+    return told(result, scan.camera, power, nameable)
+
+
+def expected(scan: Scanned, criteria: Criteria) -> tuple[float, bool]:
+    """Power, and whether the camera is named by the test of what is true, nothing drawn.
+
+    Power: of the best single test, Holm's first, by the noncentrality that the true change has; by
+    sigmas alone and how well few frames tell them, whatever is allowed beside them."""
+    by_sigma = replace(criteria, systematic_px=0.0)
+    old, new = Stated(scan.true, scan.old.covariance), Stated(scan.now, scan.new.covariance)
+    result = drift(old, new, by_sigma, n_frames=scan.n_frames)
+    alpha = criteria.alpha / len(result.tests)
+    power = max(float(rejecting(alpha, t.dof, t.nu)(t.chi2)) for t in result.tests)
+    return power, result.drifted == (scan.camera,)
+
+
+def told(result: Drift, camera: int | None, power: float, nameable: bool) -> Trial:
     """The drift in the words that are counted; camera: that which changed, if any."""
     surest = min(result.tests, key=lambda test: test.p_value)
     worst = max(result.decisive, key=lambda test: test.detectable_px)
     return Trial(
         camera, result.verdict, result.drifted, result.moved, surest.p_corrected,
         f"{surest.group} {surest.cameras}", result.detectable_px, f"{worst.group} {worst.cameras}",
-        power,
+        power, nameable,
     )  # fmt: skip
 
 
@@ -152,7 +183,7 @@ def after(rig: SimulatedRig, change: Change, camera: int, rng: np.random.Generat
     """The rig with one camera changed, in the frame of the first camera."""
     cameras, placed = list(rig.cameras), list(rig.cam_from_rig)
     here = placed[camera]
-    if change == "turned":
+    if change.endswith("turned"):
         axis = rng.standard_normal(3)
         turn = np.radians(TURN_DEG) * axis / np.linalg.norm(axis)
         placed[camera] = Transform.exp(turn, np.zeros(3)) @ here  # about its own centre
@@ -186,6 +217,8 @@ class Summary:
     inconclusive: float
     named: float
     among: float
+    nameable: int  # trials whose sigmas let expect the camera to be named
+    named_nameable: float  # of these
     detectable_px: float  # median
     worst: str  # where it most often is
     found: str  # the test that most often is the surest
@@ -196,6 +229,7 @@ class Summary:
 def summarise(case: Case, trials: Sequence[Trial]) -> Summary:
     """Shares over all trials of a case."""
     allowed = [one for one in trials if one.power >= Criteria().power]
+    nameable = [one for one in allowed if one.nameable]
 
     def share(verdict: Verdict, of: Sequence[Trial] = trials) -> float:
         return float(np.mean([one.verdict == verdict for one in of])) if of else 0.0
@@ -209,6 +243,8 @@ def summarise(case: Case, trials: Sequence[Trial]) -> Summary:
         inconclusive=share("inconclusive"),
         named=float(np.mean([one.named for one in trials])),
         among=float(np.mean([one.among for one in trials])),
+        nameable=len(nameable),
+        named_nameable=float(np.mean([one.named for one in nameable])) if nameable else 0.0,
         detectable_px=float(np.median([one.detectable_px for one in trials])),
         worst=_commonest([one.worst for one in trials]),
         found=_commonest([one.found for one in trials]),
@@ -242,7 +278,8 @@ def overview(summaries: Sequence[Summary]) -> Table:
     table = Table(title=f"old calibrations right to {OLD_PX:g} px")
     for column in (
         "rig", "change", "trials", "replace", "keep", "inconclusive", "right camera\nnamed",
-        "or among\nthose named", "where sigmas\nallow it", "detectable\npx", "where", "surest test",
+        "or among\nthose named", "replace where\nsigmas allow it",
+        "named where\nthey do", "detectable\npx", "where", "surest test",
     ):  # fmt: skip
         table.add_column(column, justify="right")
     for s in summaries:
@@ -250,6 +287,7 @@ def overview(summaries: Sequence[Summary]) -> Table:
         table.add_row(
             s.rig, s.change, f"{s.trials}", *(f"{100 * share:.0f} %" for share in shares),
             f"{100 * s.replace_allowed:.0f} % of {s.allowed}" if s.allowed else "–",
+            f"{100 * s.named_nameable:.0f} % of {s.nameable}" if s.nameable else "–",
             f"{s.detectable_px:.2f}", s.worst, s.found,
         )  # fmt: skip
     return table

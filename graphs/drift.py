@@ -109,13 +109,16 @@ def drift(
     scale_free: bool = False,
     tested: Collection[tuple[str, Group]] | None = None,
     cov_difference: Covariance | None = None,
+    n_frames: int | None = None,
+    n_frames_old: int | None = None,
 ) -> Drift:
     """Hold a new calibration against an old one of the same cameras, in the same lenses.
 
     Lengths in one unit; scale_free: those of the new one in any. tested: (camera, group) that the
     new solve freed; all, where it is not given. Lens groups that are not among them count as
     unchanged. cov_difference: of new less old where these are not independent, labelled and in the
-    frame as they are; the sum of theirs, where it is not given.
+    frame as they are; the sum of theirs, where it is not given. n_frames, n_frames_old: on
+    which the new and the old covariance rest, which few of them leave in doubt; None: it is known.
     Raises ValueError where cameras are not the same, in the same order and lenses.
     """
     criteria = criteria or Criteria()
@@ -129,7 +132,7 @@ def drift(
         frozenset(g for g in GROUPS if tested is None or (camera.name, g) in tested)
         for camera in old.estimate.cameras
     )
-    apart = changes(old, new, criteria.range, freed, cov_difference)
+    apart = changes(old, new, criteria.range, freed, cov_difference, (n_frames_old, n_frames))
     lenses = tuple(of_lenses(apart, criteria.systematic_px))
     places = of_places(apart, criteria.systematic_px, scale_free)
     first = judged([*lenses, *places.rows()], criteria)

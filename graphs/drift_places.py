@@ -17,7 +17,7 @@ import numpy as np
 
 from graphs.frames import FloatArray, Transform
 from graphs.pose_covariance import adjoint
-from graphs.significance import Significance, significance
+from graphs.significance import Guess, Significance, degrees, significance
 
 # Cameras that sit as they sat are taken for moved in so many of 100 cases: beyond that, of sets of
 # cameras whose moving would explain a change, all are named that explain it nearly as well: chi2
@@ -35,6 +35,7 @@ class Places:
 
     change: FloatArray  # (6 n,)
     cov: FloatArray  # (6 n, 6 n) px^2
+    guesses: tuple[Guess, ...]  # parts of it that rest on how much frames differ
     frames: FloatArray  # (6 n, g) orthonormal: what changes of the rig's frame, and size, can do
 
     @property
@@ -53,7 +54,10 @@ class Places:
         """Whether some cameras sit to each other as they sat."""
         rows = _rows(cameras)
         change, free = self.without_frames(cameras)
-        return significance(change, free.T @ self.cov[np.ix_(rows, rows)] @ free)
+        part = np.zeros((free.shape[1], len(self.change)))
+        part[:, rows] = free.T
+        cov = part @ self.cov @ part.T
+        return significance(change, cov, degrees(cov, [one.carried(part) for one in self.guesses]))
 
     def in_frame_of(self, cameras: Collection[int]) -> FloatArray:
         """P (6 n, 6 n): P change is what is left in the frame, and of the size, of some cameras.

@@ -91,6 +91,8 @@ def judge(
     scale_free: bool = False,
     tested: Collection[tuple[str, Group]] | None = None,
     cov_difference: Covariance | None = None,
+    n_frames: int | None = None,
+    n_frames_old: int | None = None,
     notes: Sequence[str] = (),
 ) -> Judged:
     """Hold a new calibration against an old one of the same cameras, lenses and unit of length.
@@ -105,7 +107,8 @@ def judge(
         old = Stated(in_first, covariance)
     found = drift(
         old, new, options.criteria(unit),
-        scale_free=scale_free, tested=tested, cov_difference=cov_difference,
+        scale_free=scale_free, tested=tested, cov_difference=cov_difference, n_frames=n_frames,
+        n_frames_old=n_frames_old,
     )  # fmt: skip
     said = list(notes)
     if assumed:
@@ -117,18 +120,23 @@ def judge(
         size = "the baseline's length" if len(old.estimate.cameras) == 2 else "the rig's size"
         said.append(f"the two have no metric scale in common: {size} is not judged")
     record = _record(found, unit, options.old_sigma_px if assumed else None, tuple(said))
-    of_old = found.verdict == "inconclusive" and not cov_difference and _of_old(found, tested)
+    of_old = (
+        found.verdict == "inconclusive" and not cov_difference and _of_old(found, tested, n_frames)
+    )
     lines = tuple(verdict_lines(record, of_old))
     return Judged(record.model_copy(update={"lines": lines}), found)
 
 
-def _of_old(found: Drift, tested: Collection[tuple[str, Group]] | None) -> bool:
+def _of_old(
+    found: Drift, tested: Collection[tuple[str, Group]] | None, n_frames: int | None
+) -> bool:
     """Whether this scan would do, were the old calibration exact."""
     exact = Stated(found.old.estimate, EXACT)
     criteria = replace(found.criteria, depth_ranges=())
     return not drift(
-        exact, found.new, criteria, scale_free=found.scale_free, tested=tested
-    ).unresolved
+        exact, found.new, criteria,
+        scale_free=found.scale_free, tested=tested, n_frames=n_frames,
+    ).unresolved  # fmt: skip
 
 
 def _record(
@@ -177,6 +185,7 @@ def _test(found: Drift, test: GroupDrift, unit: Unit) -> DriftTest:
         changes=tuple(_changes(test, unit)),
         chi2=test.chi2 if np.isfinite(test.chi2) else None,
         dof=test.dof,
+        nu=test.nu if np.isfinite(test.nu) else None,
         p_value=test.p_value,
         p_corrected=test.p_corrected,
         effect_px=test.effect_px,

@@ -29,6 +29,7 @@ class DriftTest(Record):
     changes: tuple[DriftChange, ...]
     chi2: float | None  # None: infinite, what was exactly known changed
     dof: int
+    nu: float | None = None  # degrees of freedom of the covariance itself; None: it is known
     p_value: float
     p_corrected: float  # Holm's, of all tests
     effect_px: float

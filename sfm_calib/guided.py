@@ -154,7 +154,7 @@ def _map_coarsely(
     check_overlap(scan, counts)
     whole = len(nominal) == len(scan.cameras)
     rig = tuple(nominal[i] for i in range(len(nominal))) if whole else None
-    map_matched(scan, config, rig, database, place, progress)
+    map_matched(scan, config, rig, database, place, progress, rig_at_need=True)
 
 
 def _overlapping(scan: Scan, known: dict[int, Camera], nominal: dict[int, Transform]) -> np.ndarray:

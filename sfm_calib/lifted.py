@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import scipy.linalg
@@ -16,9 +17,9 @@ from sfm_calib.partial import reference_of, stated_of
 
 
 def lifted(
-    rig: CameraRig, least: LensName, sigma_px: float, distance: float
+    rig: CameraRig, least: LensName, cameras: Sequence[str], sigma_px: float, distance: float
 ) -> tuple[CameraRig, tuple[str, ...]]:
-    """With every camera whose lens `least` holds in that one, and a note on each.
+    """With those of `cameras` whose lens `least` holds in that one, and a note on each.
 
     What the simpler lens leaves out would be taken for drift: on rectified images of a street, a
     pinhole is 3 % short in focal length, and eight times its sigma. Coefficients that are new are
@@ -26,7 +27,8 @@ def lifted(
     """
     side, notes, new_names = stated_of(rig), [], []
     for index, camera in enumerate(rig.cameras):
-        if camera.lens == least or not holds(least, camera.lens):
+        simpler = camera.lens != least and holds(least, camera.lens)
+        if not simpler or camera.name not in cameras:
             continue
         side = as_lens(side, index, least)[0]
         wider = side.estimate.cameras[index]

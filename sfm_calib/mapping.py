@@ -147,16 +147,21 @@ def map_matched(
     database: Path,
     place: Path,
     progress: Progress,
+    rig_at_need: bool = False,
 ) -> None:
     """Map freely, from several starts until most images are registered, and with the nominal rig
-    imposed where one is given; keep what explains most."""
+    imposed where one is given; keep what explains most.
+
+    rig_at_need: impose the rig only where free mapping places too few.
+    """
     best = (0, 0, 0)
     for number, attempt in enumerate(attempts(config.seed)):
         models = colmap.map_images(scan, database, place / f"free{number}", attempt, progress)
         best = _keep_better(models, scan, place, best)
         if best[1] >= ENOUGH_REGISTERED * len(scan.images):
             break
-    if nominal is not None and colmap.can_constrain(scan):
+    needed = not rig_at_need or best[1] < ENOUGH_REGISTERED * len(scan.images)
+    if needed and nominal is not None and colmap.can_constrain(scan):
         constrained = place / "rig.db"
         shutil.copyfile(database, constrained)
         colmap.constrain_rig(scan, nominal, reference_of(scan, config), constrained)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
 from graphs.compare import Stated
 from graphs.compare_rig import pair_place
 from graphs.drift_picture import assumed_covariance
+from graphs.lenses import LensName
 from sfm_calib.compare_sides import renamed
 from sfm_calib.config import BaselineConfig, RigConfig
 from sfm_calib.drift import EXACT, DriftOptions
@@ -73,21 +75,33 @@ class OldCalibration:
 
 
 def old_calibration(
-    read: CameraRig, scan: Scan, cameras: Sequence[str], options: DriftOptions
+    read: CameraRig,
+    scan: Scan,
+    cameras: Sequence[str],
+    options: DriftOptions,
+    lens: Literal[LensName, "auto"] = "auto",
 ) -> OldCalibration:
     """An old calibration as it was read, for a scan of its rig.
 
     cameras: `name in OLD=name in the scan`, where the names do not tell. options: how right a file
-    without sigmas is taken to be. Raises CalibrationError where no camera is in both, where image
-    sizes differ or nothing tells them, and where it does not say how its cameras sit.
+    without sigmas is taken to be. lens: to solve with, where it holds the old one; auto: in place
+    of one too simple for a scan, a richer one. Raises CalibrationError where no camera is in both,
+    where image sizes differ or nothing tells them, and where it does not say how its cameras sit.
     """
     named, notes = _named_as(read, scan.cameras, cameras)
     rig = checked(named, dict(zip(scan.cameras, scan.sizes, strict=True)))
-    _check_sizes(rig)
+    rig, of_sizes = _sized(rig, scan)
     rig, unit = _in_unit(rig)
-    least = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
-    rig, told = lifted(rig, least, options.old_sigma_px, options.range(unit or "m"))
+    if unit == "baseline" and read.unit == "unknown":
+        notes += (f"{rig.path} states no unit of length (--metres says what it is)",)
     assumed = not rig.states_sigmas
+    wanted = lens
+    if lens == "auto" and assumed:  # who states sigmas has chosen the lens on evidence
+        wanted = RIG_LENS if len(scan.cameras) > 1 else LONE_LENS
+    if wanted != "auto":
+        distance = options.range(unit or "m")
+        rig, told = lifted(rig, wanted, scan.cameras, options.old_sigma_px, distance)
+        notes += told
     if assumed:
         reference = rig.names.index(reference_of(rig))
         side = seen_from(stated_of(rig), rig.names[reference])
@@ -95,7 +109,7 @@ def old_calibration(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )
         rig = replace(rig, covariance=covariance, cam_from_rig=side.estimate.cam_from_rig)
-    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *told))
+    return OldCalibration(rig, unit, assumed, (*rig.notes, *notes, *of_sizes))
 
 
 def _named_as(
@@ -124,14 +138,23 @@ def _named_as(
     return renamed(read, list(called.values())), notes
 
 
-def _check_sizes(rig: CameraRig) -> None:
-    """Raises CalibrationError for a camera without a size of its images, and without images."""
-    for camera in rig.cameras:
-        if camera.size == NO_SIZE:
-            raise CalibrationError(
-                f"{rig.path} does not say how large the images of {camera.name} are, and the scan "
-                "has none of it: add the size, or scan with that camera too"
-            )
+def _sized(rig: CameraRig, scan: Scan) -> tuple[CameraRig, tuple[str, ...]]:
+    """With the scan's image size, if it has but one, for cameras of neither size nor images.
+
+    Raises CalibrationError where it has several.
+    """
+    lost = [camera.name for camera in rig.cameras if camera.size == NO_SIZE]
+    if not lost:
+        return rig, ()
+    if len(set(scan.sizes)) > 1:
+        raise CalibrationError(
+            f"{rig.path} does not say how large the images of {lost[0]} are, and the scan has none "
+            "of it: add the size, or scan with that camera too"
+        )
+    size = scan.sizes[0]
+    cameras = tuple(replace(c, size=size) if c.name in lost else c for c in rig.cameras)
+    note = f"images of {', '.join(lost)} are taken to be of {size[0]} x {size[1]} px, as the scan's"
+    return replace(rig, cameras=cameras), (note,)
 
 
 def _in_unit(rig: CameraRig) -> tuple[CameraRig, Unit | None]:

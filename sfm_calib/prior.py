@@ -20,7 +20,7 @@ from graphs.frames import Transform
 from graphs.prior_rig import prior_rig
 from graphs.problem import Estimate, PriorMode, PriorRig, Problem
 from graphs.propagation import lens_names, pose_names
-from sfm_calib.config import RigConfig
+from sfm_calib.config import CameraConfig, RigConfig
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats.reading import NO_SIZE, CameraRig
 
@@ -109,6 +109,8 @@ def checked(old: CameraRig, sizes: Mapping[str, tuple[int, int]]) -> CameraRig:
 def with_lenses(config: RigConfig, old: CameraRig, cameras: Sequence[str]) -> RigConfig:
     """The configuration with the lens of each of `cameras` that the calibration knows.
 
+    What is `fixed` without a value is held at the calibration's.
+
     Raises CalibrationError where rig.yaml, or --lens, says that it has another.
     """
     entries = dict(config.cameras)
@@ -127,12 +129,10 @@ def with_lenses(config: RigConfig, old: CameraRig, cameras: Sequence[str]) -> Ri
                 f"--lens {config.lens}: {old.path} has {camera.name} in the lens {camera.lens}, "
                 "and is held against the same alone: leave it out, or calibrate anew"
             )
-        known = {"lens": camera.lens}
-        entries[camera.name] = (
-            RigConfig.model_validate({"cameras": {camera.name: known}}).cameras[camera.name]
-            if entry is None
-            else entry.model_copy(update=known)
-        )
+        entry = CameraConfig() if entry is None else entry
+        held = {p: v for p, v in camera.named().items() if p in entry.fixed}
+        known = {"lens": camera.lens, "params": held | entry.params}
+        entries[camera.name] = entry.model_copy(update=known)
     return config.model_copy(update={"cameras": entries})
 
 

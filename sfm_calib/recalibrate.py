@@ -21,6 +21,7 @@ from graphs.consider import completed as with_old_errors
 from graphs.consider import cov_difference, sensitivity
 from graphs.covariance import Covariance
 from graphs.drift_picture import Group, lens_columns
+from graphs.frames import Transform
 from graphs.ladder import Ladder
 from graphs.problem import PriorMode, PriorRig
 from graphs.propagation import lens_names, marginal, pose_names
@@ -54,7 +55,7 @@ from sfm_calib.partial import completed
 from sfm_calib.prior import prior_of, started, with_lenses
 from sfm_calib.provenance import Replaced
 from sfm_calib.recalibration_record import Contribution, OldFile, Recalibration
-from sfm_calib.recalibration_words import assumption, messages_of, with_metres_of
+from sfm_calib.recalibration_words import assumption, doubted, messages_of, with_metres_of
 from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
@@ -123,7 +124,7 @@ def recalibrate(
     if options.metres is not None:
         read = read.metric(options.metres)
     scan = checked_scan(scan_path, config, cache, progress, watch)
-    old = old_calibration(read, scan, options.cameras, drift)
+    old = old_calibration(read, scan, options.cameras, drift, config.lens)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
     with watch.stage("tracks and mapping"):
@@ -147,6 +148,7 @@ def recalibrate(
         best.ladder, best.split, certificate,
     )  # fmt: skip
     calibration, unit = summarise(run)
+    found = doubted(found, calibration.verdict)
     calibration = _told(calibration, old, config, options, best, found, stayed)
     record = Recalibration(old=replaces, prior=best.prior.mode, freed=options.free, drift=found)
     whole = completed(calibration, old.rig, record, stayed or None)
@@ -225,10 +227,15 @@ def _drift(
         notes.append(f"only {', '.join(free)} was freed and judged: the rest counts as unchanged")
     # Lengths are compared where each side has metres of its own.
     scale_free = not (given.config.scale.measured and old.unit == "m")
+    tested = set(_tested(before, new.prior))
+    if old.unit is None:  # its cameras are in one place: it says how they are turned
+        before, after = _without_lengths(before), _without_lengths(after)
+        tested = {(name, group) for name, group in tested if group != "translation"}
     record = judge(
         before, after, old.unit or "m", options,
-        scale_free=scale_free, tested=set(_tested(before, new.prior)),
+        scale_free=scale_free, tested=tested,
         cov_difference=new.cov_change, notes=notes,
+        n_frames=len(new.refinement.problem.frame_names), n_frames_old=old.rig.n_frames,
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
 
@@ -251,6 +258,14 @@ def _part(side: Stated, names: Sequence[str]) -> Stated:
     return Stated(
         estimate, marginal(side.covariance, of) if of else Covariance((), np.zeros((0, 0)))
     )
+
+
+def _without_lengths(side: Stated) -> Stated:
+    """With its cameras in one place, which is known."""
+    kept = [name for name in side.covariance.names if ".translation_" not in name]
+    placed = tuple(Transform(t.rotation, np.zeros(3)) for t in side.estimate.cam_from_rig)
+    known = marginal(side.covariance, kept) if kept else side.covariance
+    return Stated(replace(side.estimate, cam_from_rig=placed), known)
 
 
 def _tested(side: Stated, prior: PriorRig) -> Iterator[tuple[str, Group]]:

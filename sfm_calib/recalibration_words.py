@@ -11,6 +11,8 @@ from sfm_calib.drift_record import DriftRecord
 from sfm_calib.old_calibration import OldCalibration
 
 OF_PLACE = ("rotation", "translation", "places")
+UNUSABLE = "not usable: "  # as the verdict's reasons begin
+MOST_REASONS = 3
 
 
 def assumption(old: OldCalibration, old_sigma_px: float) -> str:
@@ -69,13 +71,18 @@ def messages_of(
     yield from _of_rig_yaml(old, config)
 
 
+def doubted(drift: DriftRecord, verdict: result.Verdict | None) -> DriftRecord:
+    """The drift test, told that what it says to replace the old calibration by is not usable."""
+    if drift.verdict != "replace" or verdict is None or verdict.usable:
+        return drift
+    return drift.model_copy(update={"lines": (*drift.lines, _not_by_this(verdict))})
+
+
 def _not_by_this(verdict: result.Verdict) -> str:
-    unknown = dict.fromkeys(name for weak in verdict.weak for name in weak.parameters)
-    what = f": {', '.join(unknown)} are not determined" if unknown else ""
-    return (
-        f"the old calibration does not hold, but this scan cannot replace it{what}; scan again as "
-        "the verdict says"
-    )
+    reasons = [m.removeprefix(UNUSABLE) for m in verdict.messages if m.startswith(UNUSABLE)]
+    more = len(reasons) - MOST_REASONS
+    told = "; ".join(reasons[:MOST_REASONS]) + (f"; and {more} more" if more > 0 else "")
+    return f"the old calibration does not hold, but this scan cannot replace it: {told}"
 
 
 def _moved(drift: DriftRecord) -> bool:
@@ -84,11 +91,14 @@ def _moved(drift: DriftRecord) -> bool:
 
 def _of_rig_yaml(old: OldCalibration, config: RigConfig) -> Iterator[str]:
     """Which of two that speak of the same parameter is heard."""
+    known = {camera.name: camera.named() for camera in old.rig.cameras}
     for name, said in config.cameras.items():
-        if name not in old.rig.names:
+        if name not in known:
             continue
-        if own := dict.fromkeys([*said.params, *said.fixed]):
+        if own := [p for p, value in said.params.items() if value != known[name][p]]:
             yield f"{name}: {', '.join(own)} as rig.yaml has it, not as the old calibration has"
+        if held := [p for p in said.fixed if p not in own]:
+            yield f"{name}: {', '.join(held)} held at the old calibration's, as rig.yaml says"
         placed = said.cam_from_rig
         if placed and (placed.sigma_rotation_deg or placed.sigma_translation):
             yield f"{name}: rig.yaml's cam_from_rig is believed beside the old calibration's"

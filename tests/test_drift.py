@@ -14,12 +14,12 @@ from graphs.compare_chance import changed
 from graphs.covariance import Covariance
 from graphs.drift import Drift, drift
 from graphs.drift_picture import GROUPS, Group, assumed_covariance, picture, share
-from graphs.drift_tests import Criteria, GroupDrift
+from graphs.drift_tests import OF_PLACE, Criteria, GroupDrift
 from graphs.frames import FloatArray, Transform, exp_rotation
 from graphs.pose_covariance import poses_as, rereferenced
 from graphs.problem import Estimate
 from graphs.propagation import marginal
-from graphs.significance import detectable, holm, significance
+from graphs.significance import Guess, degrees, detectable, holm, noncentrality, significance
 from sfm_calib.simulate.rigs import RigName, make_rig
 
 EXACT = Criteria(systematic_px=0.0, depth_ranges=())
@@ -103,6 +103,47 @@ def test_what_is_called_detectable_is_found_as_often_as_promised() -> None:
     assert found[1] > found[0]
 
 
+@pytest.mark.parametrize("nu", [4, 7, 39])
+def test_a_covariance_guessed_of_few_frames_is_allowed_for(nu: int) -> None:
+    """Its size scatters as that of nu + 1 frames: p-values stay uniform, power as promised."""
+    rng, n, alpha, power = np.random.default_rng(nu), 1000, 0.01, 0.9
+    size = noncentrality(alpha, 3, power, nu) ** 0.5
+    guesses = rng.chisquare(nu, n) / nu
+    errors = rng.standard_normal((n, 3))
+    apart = [errors, errors + np.array([size, 0.0, 0.0])]
+    p, q = (
+        [significance(e, g * np.eye(3), nu).p_value for e, g in zip(one, guesses, strict=True)]
+        for one in apart
+    )
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+    found = np.mean(np.array(q) < alpha)
+    assert found == pytest.approx(power, abs=4 * (power * (1 - power) / n) ** 0.5)
+    assert detectable(4 * np.eye(3), alpha, power, nu) == pytest.approx(2 * size)
+
+
+def test_many_frames_are_as_good_as_a_known_covariance() -> None:
+    for dof in (1, 3, 18):
+        known = noncentrality(0.003, dof, 0.95)
+        sizes = [noncentrality(0.003, dof, 0.95, nu) for nu in (1, 1.5, 3, 7, 39, 200, 2e4)]
+        assert sizes == sorted(sizes, reverse=True)
+        assert known < sizes[-2] < 1.12 * known
+        assert sizes[-1] == pytest.approx(known, rel=1e-3)
+    # Where the series of the noncentral F is not summed any more, it goes on as it was.
+    near, far = (noncentrality(alpha, 3, 0.95, 2) for alpha in (0.0031, 0.0029))
+    assert near < 3e3 < far or far < 1.1 * near
+
+
+def test_what_is_known_beside_a_guess_makes_it_matter_less() -> None:
+    half, whole = Guess(0.5 * np.eye(3), 10), Guess(np.eye(3), 10)
+    assert degrees(np.eye(3), [half]) == pytest.approx(40)
+    assert degrees(np.eye(3), [Guess(np.diag([0.5, 1.0, 0.0]), 10)]) == pytest.approx(10)
+    assert degrees(np.eye(3), [Guess(np.zeros((3, 3)), 10)]) == np.inf
+    assert degrees(np.eye(3), [replace(whole, nu=np.inf)]) == np.inf
+    # Two halves of many and of few: the few count.
+    assert degrees(np.eye(3), [half, replace(half, nu=90)]) == pytest.approx(36)
+    assert degrees(np.eye(3), []) == np.inf
+
+
 def test_an_assumed_covariance_errs_by_what_is_assumed() -> None:
     """A camera's own part, all groups together, in the picture."""
     side = rig("stereo", 0.3)
@@ -172,6 +213,31 @@ def test_what_is_allowed_beside_the_sigmas_is_not_drift() -> None:
     off = Stated(drawn(side, rng).estimate, sure.covariance)
     assert drift(sure, off, EXACT).verdict == "replace"
     assert drift(sure, off, replace(USUAL, systematic_px=0.2)).verdict == "keep"
+
+
+def test_few_frames_make_a_new_calibration_doubtful_and_an_old_one_not() -> None:
+    side, rng = rig("triple"), np.random.default_rng(5)
+    exact = Stated(side.estimate, Covariance((), np.zeros((0, 0))))
+    new = drawn(side, rng)
+    many, few = (drift(exact, new, EXACT, n_frames=n) for n in (None, 8))
+    for one, other in zip(many.tests, few.tests, strict=True):
+        # What linear propagation misses, of the new one's errors too, is a guess as they are.
+        assert other.nu == pytest.approx(7)
+        assert other.p_value == pytest.approx(stats.f.sf(one.chi2 / one.dof, one.dof, 7), rel=1e-6)
+        assert other.detectable_px > 1.5 * one.detectable_px
+    known = drift(new, exact, EXACT, n_frames=8)
+    assert {test.nu for test in known.tests} == {np.inf}
+    assert {drift(exact, new, EXACT, n_frames=1).tests[0].nu} == {1.0}
+
+
+def test_a_camera_is_not_cleared_by_few_frames_as_by_many() -> None:
+    """Which moved is told by the same tests: of few frames, more cameras stay in question."""
+    side = rig("triple", 0.3)
+    new = turned(side, 1, 0.3)
+    many, few = (drift(side, new, EXACT, n_frames=n) for n in (None, 4))
+    assert many.moved == ((1,),)
+    assert len(few.tests) == len(many.tests)
+    assert few.tests[-1].p_value > many.tests[-1].p_value
 
 
 # ---- one camera changed --------------------------------------------------------------------
@@ -335,6 +401,22 @@ def test_the_covariance_that_is_allowed_makes_all_tests_weaker() -> None:
         return np.array([(test.detectable_px, test.expected_px) for test in tests])
 
     assert (sizes(0.3) > sizes(0.0)).all()
+
+
+def test_so_much_is_allowed_as_is_said() -> None:
+    """Of sides that are exact: a fifth of the variance to each group, to a place less."""
+    side = rig("stereo")
+    exact = Stated(side.estimate, Covariance((), np.zeros((0, 0))))
+    result = drift(exact, with_moves(exact, cam1__fx=1e-3), replace(EXACT, systematic_px=0.2))
+    variance = 0.2**2 / 5
+    for group, share_of in (("focal", 1), ("distortion", 1), ("lens", 3)):
+        expected = (share_of * variance) ** 0.5
+        assert test_of(result, (1,), group).expected_px == pytest.approx(expected, rel=1e-6)
+    # In the frame of the first camera, which errs as much.
+    turned_px = test_of(result, (0, 1), "rotation").expected_px
+    assert turned_px > (2 * variance) ** 0.5
+    places = test_of(result, (0, 1), "places").expected_px
+    assert places < (2 * variance) ** 0.5 * (1 + OF_PLACE**2) ** 0.5 / 2**0.5
 
 
 def test_a_direction_that_is_hardly_known_takes_no_length_along() -> None:

@@ -96,7 +96,7 @@ def test_stages_are_redone_exactly_when_their_inputs_changed(tmp_path, monkeypat
             map_scan(read(), config, [lens] * 2, {}, Cache(tmp_path / "cache", fresh), silent)
         return done
 
-    assert reach_the_models(RigConfig(), "radtan") == ["_extract", "_match", "_map"]
+    assert reach_the_models(RigConfig(), "radtan") == ["_extract", "_match", "map_matched"]
     lens, image = "radtan", tmp_path / "scan" / "left" / "1.png"
     if change == "lens":
         lens = "pinhole"
@@ -107,6 +107,6 @@ def test_stages_are_redone_exactly_when_their_inputs_changed(tmp_path, monkeypat
     elif change == "image gone":
         image.unlink()
     config = RigConfig(**change) if isinstance(change, dict) else RigConfig()
-    every = ["_extract", "_match", "_map"]
+    every = ["_extract", "_match", "map_matched"]
     expected = every[every.index(first) :] if first else []
     assert reach_the_models(config, lens, change == "fresh") == expected

@@ -31,4 +31,5 @@ def rig_of(calibration: Calibration, path: Path) -> CameraRig:
         tuple(calibration.cam_from_rig(name) for name in names),
         unit,
         marginal(stated, known) if known else NOTHING,
+        n_frames=calibration.solve.n_frames if calibration.solve else None,
     )

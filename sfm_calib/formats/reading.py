@@ -46,6 +46,7 @@ class CameraRig:
     unit: LengthUnit = "unknown"
     covariance: Covariance = NOTHING  # no names: the file states no sigmas
     notes: tuple[str, ...] = ()
+    n_frames: int | None = None  # that the covariance rests on; None: not stated
 
     @property
     def names(self) -> tuple[str, ...]:

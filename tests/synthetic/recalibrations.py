@@ -21,6 +21,7 @@ from sfm_calib.config import RigConfig
 from sfm_calib.drift import DriftOptions
 from sfm_calib.formats import read_calibration
 from sfm_calib.formats.reading import CameraRig
+from sfm_calib.images import Scan, read_scan
 from sfm_calib.mapping import Mapped
 from sfm_calib.recalibrate import Recalibrated, RecalibrateOptions, recalibrate
 from sfm_calib.result import save_calibration
@@ -141,3 +142,15 @@ def moved(old: CameraRig, name: str, turn_deg: float = 0.0, focal: float = 1.0) 
         replace(c, params=c.params * by) if i == j else c for j, c in enumerate(old.cameras)
     )
     return replace(old, cameras=cameras, cam_from_rig=placed)
+
+
+def larger(old: CameraRig, by: float) -> CameraRig:
+    """With places that many times as far apart."""
+    assert old.cam_from_rig
+    return replace(old, cam_from_rig=tuple(t.scaled(by) for t in old.cam_from_rig))
+
+
+def scan_of(names: tuple[str, ...]) -> Scan:
+    """`pictures`, read."""
+    place = pictures(names)
+    return read_scan(place, Cache(place / "cache"), "stem", 80, silent)
