@@ -14,7 +14,7 @@ from scipy import stats
 
 from graphs.compare import Change, Difference, Frames, Sights, Stated, by_change, difference, sights
 from graphs.compare_rig import as_lens
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING
 from graphs.frames import FloatArray, Transform, exp_rotation, log_rotation
 from graphs.problem import Estimate
 from graphs.propagation import projection
@@ -28,7 +28,6 @@ LEAST_RELATIVE = 1e-5  # sigma of a direction over the largest: less is rounding
 LEAST_SIGMA_PX = 1e-5  # ten times what unprojecting leaves
 ROOM = 3.0  # sigmas, of what a direction that does not count may hold
 NO_CHANGE = Change(Transform.identity())
-NOTHING = Covariance((), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)

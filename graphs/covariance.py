@@ -31,3 +31,6 @@ class Covariance:
         weights = np.array([(name == a) - (name == b) for name in self.names], dtype=np.float64)
         variance = float(weights @ self.matrix @ weights)
         return max(variance, 0.0) ** 0.5
+
+
+NOTHING = Covariance((), np.zeros((0, 0)))  # of what is exactly known, or states no sigmas

@@ -323,25 +323,6 @@ def _size_of_unit(prior: PriorRig, estimate: Estimate) -> float:
     return float(np.linalg.norm(estimate.cam_from_rig[index].translation))
 
 
-def exactly_held(in_unit: Estimate, prior: PriorRig) -> Estimate:
-    """The estimate with what is held at the prior's very values; lengths in the result's unit."""
-    cameras, places = list(in_unit.cameras), list(in_unit.cam_from_rig)
-    indices = cameras_of(prior, in_unit)
-    size = _size_of_unit(prior, in_unit)
-    for i, camera, known in zip(indices, prior.cameras, prior.cam_from_rig, strict=True):
-        held = np.array([name in prior.held for name in lens_names(camera)])
-        params = np.where(held, camera.params, cameras[i].params)
-        cameras[i] = replace(cameras[i], params=params)
-        turn, centre = places[i].rotation, places[i].inverse.translation
-        if f"{camera.name}.rotation_x" in prior.held:
-            turn = known.rotation
-        if f"{camera.name}.translation_x" in prior.held:
-            centre = known.inverse.translation * size
-        if camera.name != prior.reference:
-            places[i] = Transform(turn, -turn @ centre)
-    return replace(in_unit, cameras=tuple(cameras), cam_from_rig=tuple(places))
-
-
 def baseline_sigma(prior: PriorRig) -> float:
     """Relative sigma of its longest baseline, where it gives the scale."""
     lengths = [float(np.linalg.norm(placed.translation)) for placed in prior.cam_from_rig]

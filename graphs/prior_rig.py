@@ -7,14 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphs.compare import Stated
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import FloatArray
 from graphs.pose_covariance import rereferenced
 from graphs.problem import Estimate, PriorMode, PriorRig
 from graphs.propagation import lens_names, marginal, pose_names
 from graphs.unit import in_unit_baseline
-
-NOTHING = Covariance((), np.zeros((0, 0)))
 
 
 def prior_rig(

@@ -48,7 +48,6 @@ from sfm_calib.worker import run_apart
 # The demo rig is placed whole with 300; the corridor's specular floor wants more.
 COARSE_FEATURES = 400
 IN_SEQUENCE = 0.5  # of the images match the next of their camera; photographs in no order do not
-PAIRS_A_STEP = 20  # of progress
 
 
 def map_with_prior(

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from graphs.compare import Stated
 from graphs.consider import completed as with_old_errors
 from graphs.consider import cov_difference, sensitivity
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.drift_picture import Group, lens_columns
 from graphs.frames import Transform
 from graphs.ladder import Ladder
@@ -277,9 +277,7 @@ def _part(side: Stated, names: Sequence[str]) -> Stated:
         cameras=tuple(side.estimate.cameras[i] for i in places),
         cam_from_rig=tuple(side.estimate.cam_from_rig[i] for i in places),
     )
-    return Stated(
-        estimate, marginal(side.covariance, of) if of else Covariance((), np.zeros((0, 0)))
-    )
+    return Stated(estimate, marginal(side.covariance, of) if of else NOTHING)
 
 
 def _without_lengths(side: Stated) -> Stated:

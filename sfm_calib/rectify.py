@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from graphs.camera import Camera, focal_on_axis, unproject
+from graphs.covariance import NOTHING
 from graphs.frames import FloatArray, Transform
 from graphs.rectification import Rectification, projection_matrices, rectification
 from graphs.virtual import Turned, pinhole
@@ -17,7 +18,6 @@ from sfm_calib import sources
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.files import write_atomically
 from sfm_calib.formats import CameraRig
-from sfm_calib.formats.reading import NOTHING
 from sfm_calib.images import Progress
 from sfm_calib.resample import resampling
 from sfm_calib.result import save_calibration

@@ -10,13 +10,13 @@ import numpy as np
 
 import sfm_calib
 from graphs.camera import Camera, focal_on_axis
+from graphs.covariance import NOTHING
 from graphs.frames import Transform
 from graphs.virtual import Turned, share_shown
 from sfm_calib import sources
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256, write_atomically
 from sfm_calib.formats import NO_SIZE, CameraRig
-from sfm_calib.formats.reading import NOTHING
 from sfm_calib.images import Progress
 from sfm_calib.provenance import Provenance
 from sfm_calib.resample import maps_file, resample, resampling

@@ -12,7 +12,7 @@ from rich.console import Console
 from synthetic.cameras import camera_of
 
 from graphs.camera import Camera, fit_lens
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import Transform
 from graphs.pose_covariance import rereferenced
 from graphs.problem import Estimate
@@ -23,7 +23,6 @@ from sfm_calib.compare_record import Comparison
 from sfm_calib.compare_terminal import print_compared
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import NO_SIZE, CameraRig, LengthUnit
-from sfm_calib.formats.reading import NOTHING
 from sfm_calib.report.comparison import render_comparison
 
 LENS = replace(camera_of("radtan"), name="left")

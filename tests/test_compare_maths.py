@@ -11,9 +11,9 @@ from synthetic.cameras import camera_of
 
 from graphs.camera import Camera, project, unproject
 from graphs.compare import Difference, Frames, Stated, difference, sights
-from graphs.compare_chance import NOTHING, ChiSquare, changed, chi_square
+from graphs.compare_chance import ChiSquare, changed, chi_square
 from graphs.compare_rig import as_lens, depth_errors, holds, pair_place
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.image_grid import image_grid
 from graphs.pose_covariance import rereferenced

@@ -11,7 +11,7 @@ from rich.console import Console
 from test_drift import drawn, rig, turned
 
 from graphs.compare import Stated
-from graphs.compare_chance import NOTHING
+from graphs.covariance import NOTHING
 from graphs.problem import Estimate
 from sfm_calib.drift import EXIT_STATUS, DriftOptions, judge
 from sfm_calib.drift_record import DriftRecord

@@ -16,6 +16,7 @@ from test_partial import NAMES, in_baseline, result_of, true_rig, uncertain
 from graphs.frames import Transform, exp_rotation
 from graphs.pose_covariance import rereferenced
 from sfm_calib.cli import main
+from sfm_calib.drift import DriftOptions, judge
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
@@ -27,6 +28,7 @@ from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.history import render_history
 from sfm_calib.result import Calibration, save_calibration
 
+WITHOUT_DEPTHS = DriftOptions(depth_ranges=())
 DAY = datetime(2026, 1, 1, 12, tzinfo=UTC)
 
 
@@ -98,9 +100,10 @@ def test_what_replaces_what_is_known_by_hash(tmp_path: Path) -> None:
     written(rig_of_day(), tmp_path / "first.json")
     old = calibration_sha256(tmp_path / "first.json")
     (tmp_path / "first.json").rename(tmp_path / "moved.json")
+    drift = judge(stated_of(rig_of_day()), stated_of(rig_of_day(1)), "m", WITHOUT_DEPTHS).record
     recalibration = Recalibration(
-        old=OldFile(path="first.json", sha256=old, format="ours"),
-        prior="full", freed=("everything",), kept=("d",), drift="replace",
+        old=OldFile(path="first.json", sha256=old, format="ours"), prior="full", freed=("all",),
+        kept=("d",), drift=drift.model_copy(update={"verdict": "replace"}),
     )  # fmt: skip
     made = result_of(rig_of_day(1), "a")
     kept = made.cameras | {"d": made.cameras["d"].model_copy(update={"kept_from": old})}

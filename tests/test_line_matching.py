@@ -54,6 +54,21 @@ def test_points_behind_a_camera_do_not_match():
     assert len(matches) < 0.3 * len(a)  # those far away, which lie near infinity either way
 
 
+def test_beyond_the_other_camera_nothing_matches():
+    """The line goes on beyond the epipole too, to what lies behind the first camera."""
+    camera = camera_of("radtan")
+    descriptors = np.random.default_rng(0).integers(0, 120, (8, 128)).astype(np.uint8)
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.full(8, 4.0)], axis=1)
+    ahead = Transform(np.eye(3), np.array([0.0, 0.0, 1.0]))  # b stands a unit behind a
+    a = Features(project(camera, ring), np.ones(8), descriptors)
+    for across, n in ((1.0, 8), (-1.0, 0)):
+        seen = project(camera, (ahead @ ring) * [across, across, 1.0])
+        b = Features(seen, np.ones(8), descriptors)
+        matches, _ = match_along_lines(sight_of(camera, a), sight_of(camera, b), ahead)
+        assert (matches[:, 0] == matches[:, 1]).sum() == n
+
+
 def test_a_camera_that_only_turned_matches_too():
     camera, (a, _) = scene("radtan")
     still = Transform.identity()

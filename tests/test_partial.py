@@ -14,14 +14,13 @@ from rich.console import Console
 from synthetic.cameras import camera_of
 
 from graphs.compare import Stated
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import FloatArray, Transform, exp_rotation, log_rotation
 from graphs.pose_covariance import relative, rereferenced
 from graphs.propagation import lens_names, marginal, pose_names
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import CameraRig, LengthUnit
 from sfm_calib.formats.ours import rig_of
-from sfm_calib.formats.reading import NOTHING
 from sfm_calib.partial import Completed, completed, in_longest_baseline, stated_of, with_missing
 from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.rows import camera_tables

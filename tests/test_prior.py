@@ -10,7 +10,7 @@ import pytest
 from synthetic.earlier import NAMES, old, scan
 from synthetic.scans import silent
 
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import Transform
 from graphs.pose_covariance import rereferenced
 from graphs.problem import Estimate, PriorMode
@@ -18,7 +18,7 @@ from graphs.propagation import lens_names, marginal, pose_names
 from sfm_calib.calibrate import Stopwatch, determine, options_of
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.formats.reading import NO_SIZE, NOTHING, CameraRig, LengthUnit
+from sfm_calib.formats.reading import NO_SIZE, CameraRig, LengthUnit
 from sfm_calib.images import Scan
 from sfm_calib.mapping import Mapped
 from sfm_calib.nominal import lens_priors, start_from_config

@@ -16,11 +16,11 @@ from synthetic.recalibrations import (
 )
 from synthetic.scans import QUICK, simulation
 
+from graphs.covariance import NOTHING
 from sfm_calib import recalibrate as story
 from sfm_calib.cli import main
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
-from sfm_calib.formats.reading import NOTHING
 from sfm_calib.result import load_calibration
 
 # ---- the command -----------------------------------------------------------------------------

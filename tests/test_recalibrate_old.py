@@ -17,13 +17,14 @@ from synthetic.recalibrations import (
 )
 
 from graphs.camera import fit_lens
+from graphs.covariance import NOTHING
 from graphs.frames import Transform
 from graphs.propagation import pose_names
 from sfm_calib import recalibrate as story
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import read_calibration
 from sfm_calib.formats.convert import FORMATS, FormatName, exported
-from sfm_calib.formats.reading import NO_SIZE, NOTHING
+from sfm_calib.formats.reading import NO_SIZE
 from sfm_calib.recalibrate import recalibrate
 
 # ---- what a file states ----------------------------------------------------------------------

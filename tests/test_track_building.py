@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic.problems import small_problem
@@ -89,6 +90,18 @@ def test_of_two_observations_in_an_image_the_better_stays():
     assert 0 in which and len(seen) not in which and len(kept) == len(seen)
 
 
+def test_every_point_is_seen_by_two_images():
+    """Where noise is as large as the gate, many an observation is left out."""
+    for seed in range(3):
+        problem, true = small_problem(sigma_px=GATE_PX, start_error=0.0, seed=seed, points=60)
+        seen = problem.observations
+        points, kept, _ = consistent_tracks(true, seen)
+        assert 0 < len(kept) < 0.9 * len(seen)
+        image = np.stack([kept.point, kept.frame, kept.camera], axis=1)
+        assert len(np.unique(image, axis=0)) == len(kept)
+        assert (np.bincount(kept.point, minlength=len(points)) >= 2).all()
+
+
 def test_nothing_comes_of_nothing():
     true, _ = exact()
     none = np.zeros(0, dtype=np.int64)
@@ -104,3 +117,16 @@ def test_the_nearest_point_of_rays_that_meet():
     rays = point[track] - centres
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     np.testing.assert_allclose(nearest_points(centres, rays, track), point, atol=1e-8)
+
+
+def test_near_and_far_rays_count_by_their_angle():
+    """Of a point 1 and 30 m away: the near ray, right to a millimetre, is not outvoted."""
+    point, off = np.array([0.0, 0.0, 1.0]), 2e-3
+    centres = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, -29.0], [1.0, 0.0, -29.0]])
+    rays = point - centres
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays[2:] += [0.0, off, 0.0]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    found = nearest_points(centres, rays, np.zeros(4, dtype=np.int64))[0]
+    # Along y: two rays through 0 and two through 30 off, by angle 900 times less.
+    assert found[1] == pytest.approx(30 * off / 901, rel=0.2)

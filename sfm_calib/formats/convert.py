@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from graphs.camera import Camera, carries_over, fit_lens, image_pixels, project, unproject
+from graphs.covariance import NOTHING
 from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
 from sfm_calib.errors import CalibrationError
@@ -20,7 +21,7 @@ from sfm_calib.formats.kalibr_writing import KALIBR_FORMAT
 from sfm_calib.formats.mrcal import MRCAL
 from sfm_calib.formats.nerf import NERF
 from sfm_calib.formats.ours_writing import OURS_FORMAT
-from sfm_calib.formats.reading import NO_SIZE, NOTHING, CameraRig
+from sfm_calib.formats.reading import NO_SIZE, CameraRig
 from sfm_calib.formats.ros_writing import ROS_FORMAT
 from sfm_calib.formats.urdf import URDF
 from sfm_calib.formats.writing import Export, Format

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 
 from graphs.camera import Camera
-from graphs.frames import FloatArray, Transform, log_rotation
+from graphs.frames import Transform, log_rotation
 from graphs.lenses import LensName
 from sfm_calib.formats.file_storage import NAME_OF, UNIT
 from sfm_calib.formats.reading import CameraRig
-from sfm_calib.formats.writing import Export, Format, of_camera, of_sigmas
+from sfm_calib.formats.writing import Export, Format, camera_matrix, of_camera, of_sigmas
 
 Kind = Literal["yaml", "xml", "json"]
 KINDS: dict[Kind, int] = {
@@ -68,11 +68,6 @@ def _unit_note(rig: CameraRig) -> tuple[str, ...]:
     return (f"{said}; {UNIT} says so, which OpenCV itself does not read",)
 
 
-def _matrix(camera: Camera) -> FloatArray:
-    fx, fy, cx, cy = camera.params[:4]
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
 def _write_lens(storage: cv2.FileStorage, camera: Camera, matrix: str, distortion: str) -> None:
     """What cameras share is written with the first of them."""
     if not matrix.endswith("2"):
@@ -80,7 +75,7 @@ def _write_lens(storage: cv2.FileStorage, camera: Camera, matrix: str, distortio
         storage.write("image_height", camera.size[1])
         if camera.lens == "kannala_brandt":
             storage.write(FISHEYE, 1)
-    storage.write(matrix, _matrix(camera))
+    storage.write(matrix, camera_matrix(camera))
     storage.write(distortion, camera.params[None, 4:])
 
 
@@ -102,7 +97,7 @@ def _write_several(
     storage.write("cam_ids", ",".join(camera.name.replace(",", "_") for camera in cameras))
     storage.write("image_sizes", np.array([c.size for c in cameras], dtype=np.int32))
     storage.write("is_fisheye", np.array(fisheye, dtype=np.int32))
-    storage.write("Ks", np.array([_matrix(camera) for camera in cameras]))
+    storage.write("Ks", np.array([camera_matrix(camera) for camera in cameras]))
     storage.write("distortions", np.array(distortions))
     storage.write("rvecs", np.array([log_rotation(place.rotation) for place in places]))
     storage.write("Ts", np.array([place.translation for place in places]))

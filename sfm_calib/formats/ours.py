@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.propagation import marginal
-from sfm_calib.formats.reading import NOTHING, CameraRig, LengthUnit
+from sfm_calib.formats.reading import CameraRig, LengthUnit
 from sfm_calib.result import Calibration, load_calibration
 from sfm_calib.uncertainty import unit_of
 

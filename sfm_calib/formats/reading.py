@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from graphs.camera import Camera
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
 from graphs.pose_covariance import rereferenced
@@ -23,7 +23,6 @@ from sfm_calib.result import Calibration, CameraResult, CamFromRig, RigResult, S
 # m; the longest baseline, 1 long; or whatever the file's author counted in, and did not say.
 LengthUnit = Literal["m", "baseline", "unknown"]
 NO_SIZE: Final = (0, 0)  # of an image whose size the file does not state
-NOTHING: Final = Covariance((), np.zeros((0, 0)))
 MOST_SIZE = 100_000  # px across: five times the largest sensor there is
 MOST_NUMBER = 1e9  # beyond, it is no focal length, coefficient or distance
 MOST_NAME = 200  # characters of a camera's name: file systems end at 255

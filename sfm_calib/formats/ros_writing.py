@@ -10,7 +10,14 @@ from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from sfm_calib.formats.reading import CameraRig
-from sfm_calib.formats.writing import Export, Format, file_names, of_camera, of_sigmas
+from sfm_calib.formats.writing import (
+    Export,
+    Format,
+    camera_matrix,
+    file_names,
+    of_camera,
+    of_sigmas,
+)
 
 MODELS: dict[LensName, str] = {  # sensor_msgs/distortion_models.hpp
     "brown": "plumb_bob",
@@ -34,7 +41,7 @@ LEAST_AHEAD = (
 def write_ros(rig: CameraRig) -> Export:
     """One file of one camera, else a folder with one of each."""
     cameras, notes, head = rig.cameras, of_sigmas(rig), HEAD
-    rectified = [(np.eye(3), np.column_stack([_matrix(c), np.zeros(3)])) for c in cameras]
+    rectified = [(np.eye(3), np.column_stack([camera_matrix(c), np.zeros(3)])) for c in cameras]
     if len(cameras) == 2 and rig.cam_from_rig is not None:
         places, of_frame = of_camera(rig)
         if not places[1].translation.any():
@@ -58,7 +65,7 @@ def _text(camera: Camera, R: FloatArray, P: FloatArray) -> str:
         "image_width": camera.size[0],
         "image_height": camera.size[1],
         "camera_name": camera.name,
-        "camera_matrix": _entry(_matrix(camera)),
+        "camera_matrix": _entry(camera_matrix(camera)),
         "distortion_model": MODELS[camera.lens],
         "distortion_coefficients": _entry(camera.params[None, 4:]),
         "rectification_matrix": _entry(R),
@@ -72,16 +79,11 @@ def _entry(matrix: FloatArray) -> dict[str, object]:
     return {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}
 
 
-def _matrix(camera: Camera) -> FloatArray:
-    fx, fy, cx, cy = camera.params[:4]
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
 def _pair(
     cameras: tuple[Camera, ...], second_from_first: Transform
 ) -> tuple[list[tuple[FloatArray, FloatArray]], tuple[str, ...]]:
     """R (3, 3) and P (3, 4) of each of two cameras, as ROS's own calibrator makes them."""
-    K1, K2 = (_matrix(c) for c in cameras)
+    K1, K2 = (camera_matrix(c) for c in cameras)
     fisheye = [c.lens == "kannala_brandt" for c in cameras]
     d1, d2 = (np.zeros(4) if f else c.params[4:] for c, f in zip(cameras, fisheye, strict=True))
     turn, move = second_from_first.rotation, second_from_first.translation[:, None]

@@ -7,7 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from graphs.frames import Transform
+import numpy as np
+
+from graphs.camera import Camera
+from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from sfm_calib.formats.reading import CameraRig
 
@@ -50,6 +53,12 @@ def of_camera(rig: CameraRig, reference: int = 0) -> tuple[tuple[Transform, ...]
     return tuple(places), (
         f"the file's own frame is not held: places are counted from {rig.names[reference]}",
     )
+
+
+def camera_matrix(camera: Camera) -> FloatArray:
+    """K (3, 3) of a lens, as OpenCV and ROS write it."""
+    fx, fy, cx, cy = camera.params[:4]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def of_sigmas(rig: CameraRig) -> tuple[str, ...]:
