@@ -45,7 +45,7 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.history_command import HistoryCommand, run_history
 from sfm_calib.images import camera_names, check_exists
-from sfm_calib.output import finish, output_folder, told
+from sfm_calib.output import check_apart, finish, output_folder, told
 from sfm_calib.recalibrate_command import Recalibrate, run_recalibrate
 from sfm_calib.result import load_calibration
 from sfm_calib.simulate.scan import SimulateOptions, simulate_scan
@@ -182,6 +182,7 @@ def run(command: Command, arguments: Sequence[str]) -> int:
 
 def run_calibrate(command: Calibrate, arguments: Sequence[str]) -> None:
     """Calibrate a scan, and compare with the truth where it is given."""
+    check_apart(command.scan, command.out)
     config = config_of(command.scan, arguments)
     if command.board_images and not command.board:
         raise CalibrationError("--board-images needs --board YAML: say what board they show")

@@ -24,8 +24,9 @@ def print_drift(record: DriftRecord, console: Console) -> None:
     print_line(
         console,
         f"drift in px rms over the image, of moves at {at_range(record.range, record.unit)}; p "
-        f"corrected for {len(record.tests)} tests; found: what {100 * record.power:g} % of scans "
-        f"as this one find; {record.systematic_px:g} px are allowed beside the sigmas",
+        f"corrected for {len(record.tests)} tests; found from: so much is found in any direction "
+        f"by {100 * record.power:g} % of scans like this one, in well-known directions far less is; "
+        f"{record.systematic_px:g} px are allowed beside the sigmas",
     )
     for note in record.notes:
         print_line(console, f"note: {note}")

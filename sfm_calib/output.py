@@ -24,6 +24,15 @@ from sfm_calib.terminal import print_comparison, print_line, print_result, resul
 LEAST_FREE = 20_000_000  # bytes: the report alone takes 5 MB
 
 
+def check_apart(scan: Path, out: Path) -> None:
+    """Raises CalibrationError where results would go among the images."""
+    if out.exists() and out.resolve() == scan.resolve():
+        raise CalibrationError(
+            f"-o {out} is the scan itself: choose another folder, so that results do not lie among "
+            "its images"
+        )
+
+
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
     """OUT, made where it is missing, and gone again where nothing was written to it.

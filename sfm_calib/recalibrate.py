@@ -7,8 +7,8 @@ old one is to be believed (`prior: full`), the graph is solved once more with it
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -19,12 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from graphs.compare import Stated
 from graphs.consider import completed as with_old_errors
 from graphs.consider import cov_difference, sensitivity
-from graphs.covariance import NOTHING, Covariance
-from graphs.drift_picture import Group, lens_columns
-from graphs.frames import Transform
+from graphs.covariance import Covariance
 from graphs.ladder import Ladder
 from graphs.problem import PriorMode, PriorRig
-from graphs.propagation import lens_names, marginal, pose_names
 from graphs.refine import Refinement
 from graphs.split_check import SplitCheck
 from graphs.stated_covariance import CalibrationCovariance
@@ -45,6 +42,7 @@ from sfm_calib.config import BaselineConfig, RigConfig
 from sfm_calib.contributions import contributions_of
 from sfm_calib.drift import DriftOptions, judge
 from sfm_calib.drift_record import DriftRecord
+from sfm_calib.drift_sides import part_of, tested_groups, without_lengths
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
@@ -240,8 +238,8 @@ def _drift(
 ) -> DriftRecord:
     """Of the cameras that both have."""
     names = old.common([camera.name for camera in new.refinement.estimate.cameras])
-    before = _part(old.own if new.cov_change is None else old.stated, names)
-    after = _part(new.side, names)
+    before = part_of(old.own if new.cov_change is None else old.stated, names)
+    after = part_of(new.side, names)
     notes, assumed = list(old.notes), old.assumed and new.cov_change is not None
     if assumed:
         notes.append(assumption(old, options.old_sigma_px))
@@ -249,9 +247,9 @@ def _drift(
         notes.append(f"only {', '.join(free)} was freed and judged: the rest counts as unchanged")
     # Lengths are compared where each side has metres of its own.
     scale_free = not (given.config.scale.measured and old.unit == "m")
-    tested = set(_tested(before, new.prior))
+    tested = set(tested_groups(before, new.prior))
     if old.unit is None:  # its cameras are in one place: it says how they are turned
-        before, after = _without_lengths(before), _without_lengths(after)
+        before, after = without_lengths(before), without_lengths(after)
         tested = {(name, group) for name, group in tested if group != "translation"}
     record = judge(
         before, after, old.unit or "m", options,
@@ -260,54 +258,6 @@ def _drift(
         n_frames=len(new.refinement.problem.frame_names), n_frames_old=old.rig.n_frames,
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
-
-
-def _part(side: Stated, names: Sequence[str]) -> Stated:
-    """These cameras of a calibration, in this order."""
-    known = [camera.name for camera in side.estimate.cameras]
-    places = [known.index(name) for name in names]
-    of = [
-        name
-        for camera in (side.estimate.cameras[i] for i in places)
-        for name in (*lens_names(camera), *pose_names(camera.name))
-        if name in side.covariance.names
-    ]
-    estimate = replace(
-        side.estimate,
-        cameras=tuple(side.estimate.cameras[i] for i in places),
-        cam_from_rig=tuple(side.estimate.cam_from_rig[i] for i in places),
-    )
-    return Stated(estimate, marginal(side.covariance, of) if of else NOTHING)
-
-
-def _without_lengths(side: Stated) -> Stated:
-    """With its cameras in one place, which is known."""
-    kept = [name for name in side.covariance.names if ".translation_" not in name]
-    placed = tuple(Transform(t.rotation, np.zeros(3)) for t in side.estimate.cam_from_rig)
-    known = marginal(side.covariance, kept) if kept else side.covariance
-    return Stated(replace(side.estimate, cam_from_rig=placed), known)
-
-
-def _tested(side: Stated, prior: PriorRig) -> Iterator[tuple[str, Group]]:
-    """The groups of each camera of which anything was freed.
-
-    The reference moves where all others do: what is held of one of them says that it did not.
-    """
-    for camera in side.estimate.cameras:
-        names = lens_names(camera)
-        for group, columns in lens_columns(camera):
-            if any(names[column] not in prior.held for column in columns):
-                yield camera.name, group
-    placed = [camera.name for camera in side.estimate.cameras if camera.name != prior.reference]
-    of_place: tuple[tuple[Group, slice], ...] = (
-        ("rotation", slice(0, 3)),
-        ("translation", slice(3, 6)),
-    )
-    for group, part in of_place:
-        free = [name for name in placed if not prior.held.issuperset(pose_names(name)[part])]
-        yield from ((name, group) for name in free)
-        if free == placed:
-            yield prior.reference, group
 
 
 def _unmoved(found: DriftRecord, reference: str | None) -> tuple[str, ...]:

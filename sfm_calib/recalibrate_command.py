@@ -19,7 +19,7 @@ from sfm_calib.files import refuse_overwrite
 from sfm_calib.formats import read_calibration
 from sfm_calib.formats.convert import FormatName
 from sfm_calib.images import camera_names
-from sfm_calib.output import finish, output_folder, told
+from sfm_calib.output import check_apart, finish, output_folder, told
 from sfm_calib.recalibrate import RecalibrateOptions, recalibrate
 from sfm_calib.result import load_calibration
 from sfm_calib.terminal import progress_bars, result_console
@@ -65,6 +65,7 @@ def run_recalibrate(command: Recalibrate, config: RigConfig, arguments: Sequence
 
     Raises CalibrationError as `recalibrate`, and where OUT would replace OLD.
     """
+    check_apart(command.scan, command.out)
     refuse_overwrite(command.old, command.out, command.overwrite)
     old = read_calibration(command.old)
     truth = load_calibration(command.truth) if command.truth else None

@@ -4,6 +4,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from synthetic.scans import panning_frames, picture, simulation, video
@@ -222,3 +223,14 @@ def test_decoders_leave_the_word_to_us(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert line.startswith("sfm-calib: ") and "walk.mp4 gave 0 frames" in line
+
+
+def test_results_do_not_go_among_the_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = tmp_path / "scan"
+    (scan / "left").mkdir(parents=True)
+    for command in (["calibrate"], ["recalibrate", str(tmp_path / "old.json")]):
+        assert main([*command, str(scan), "-o", str(scan / "left" / "..")]) == 2
+        assert "is the scan itself" in capsys.readouterr().err
+    assert [path.name for path in scan.iterdir()] == ["left"]

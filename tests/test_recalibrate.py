@@ -23,6 +23,7 @@ from synthetic.recalibrations import (
 
 from graphs.frames import log_rotation
 from graphs.propagation import lens_names, marginal, pose_names
+from sfm_calib import recalibrate as story
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import read_calibration
 from sfm_calib.formats.reading import CameraRig

@@ -51,6 +51,7 @@ from sfm_calib.report.weak import length_unit, weak_cards
 from sfm_calib.result import Calibration
 
 TITLE = "Calibration report"
+RECALIBRATION = "Recalibration report"
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def render(
     has_covariance = bool(calibration.covariance.names)
     drift = calibration.recalibration.drift if calibration.recalibration else None
     return page_template("page.html").render(
-        title=title,
+        title=RECALIBRATION if drift and title == TITLE else title,
         calibration=calibration,
         banner=banner(calibration),
         checks=checks_of(calibration.verdict),
