@@ -243,7 +243,7 @@ def in_longest_baseline(side: Stated) -> Stated:
     """With the longest baseline from the reference 1 long, as results without metres have it."""
     lengths = [float(np.linalg.norm(t.translation)) for t in side.estimate.cam_from_rig]
     far = int(np.argmax(lengths))
-    if lengths[far] < NO_LENGTH or lengths[far] == 1.0:
+    if lengths[far] < NO_LENGTH:
         return side
     if f"{side.estimate.cameras[far].name}.translation_x" not in side.covariance.names:
         return side.scaled(1 / lengths[far])

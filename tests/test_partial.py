@@ -60,9 +60,12 @@ def uncertain(rig: CameraRig, reference: str, seed: int, sigma: float = 1e-4) ->
 
 def erring(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
     """With an error of its covariance."""
-    error = Stated(stated_of(rig).estimate, rig.covariance).root @ rng.normal(
-        size=len(rig.covariance.names)
-    )
+    root = Stated(stated_of(rig).estimate, rig.covariance).root
+    return off_by(rig, root @ rng.normal(size=len(rig.covariance.names)))
+
+
+def off_by(rig: CameraRig, error: FloatArray) -> CameraRig:
+    """With an error in each parameter of its covariance."""
     by = dict(zip(rig.covariance.names, error.tolist(), strict=True))
     cameras, placed = [], []
     assert rig.cam_from_rig
@@ -216,6 +219,41 @@ def test_errors_are_as_large_as_stated(
     assert found.unit == ("m" if "m" in (unit_old, unit_new) else "baseline")
     assert (found.scale is not None) == (unit_old != unit_new or unit_old != "m") or len(names) == 1
     assert total / degrees == pytest.approx(1.0, abs=4 * (2 / degrees) ** 0.5)
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["of OLD", "of the scan"])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_small_error_of_one_side_moves_the_whole_as_stated(
+    case: tuple[str, tuple[str, ...], str, LengthUnit, LengthUnit], which: int
+) -> None:
+    """A covariance of one direction is that of the difference that a step along it makes."""
+    of_old, names, of_new, *units = case
+    rigs = [uncertain(true_rig(NAMES, of_old), of_old, 11)]
+    rigs.append(uncertain(true_rig(names, of_new), of_new, 12))
+    known = rigs[which].covariance
+    step = 0.01 * known.matrix[:, 0] / known.matrix[0, 0] ** 0.5  # correlated with all else
+    for i, rig in enumerate(rigs):
+        own = np.outer(step, step) if i == which else 0 * rig.covariance.matrix
+        rigs[i] = replace(rig, covariance=Covariance(rig.covariance.names, own))
+
+    def together(sign: float) -> Completed:
+        moved = [off_by(rig, sign * step) if i == which else rig for i, rig in enumerate(rigs)]
+        sides = [
+            in_baseline(rig) if unit == "baseline" else replace(rig, unit=unit)
+            for rig, unit in zip(moved, units, strict=True)
+        ]
+        return with_missing(sides[1], sides[0])
+
+    found, ends = together(0.0), [together(sign).stated.estimate for sign in (1.0, -1.0)]
+    less = CameraRig(Path("less"), "made", ends[1].cameras, ends[1].cam_from_rig, "m")
+    difference = error_of(replace(found, stated=replace(found.stated, estimate=ends[0])), less) / 2
+    stated = found.stated.covariance.matrix
+    size = np.sqrt(np.maximum(np.diag(stated), 0.0))  # an exact zero may round below
+    assert np.abs(difference).max() > 1e-7
+    np.testing.assert_allclose(np.abs(difference), size, rtol=1e-3, atol=1e-5 * size.max())
+    np.testing.assert_allclose(
+        stated, np.outer(difference, difference), rtol=5e-3, atol=1e-9 * stated.max()
+    )
 
 
 # ---- refusals ------------------------------------------------------------------------------
