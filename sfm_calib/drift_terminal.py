@@ -25,7 +25,7 @@ def print_drift(record: DriftRecord, console: Console) -> None:
         console,
         f"drift in px rms over the image, of moves at {at_range(record.range, record.unit)}; p "
         f"corrected for {len(record.tests)} tests; found from: so much is found in any direction "
-        f"by {100 * record.power:g} % of scans like this one, in well-known directions far less is; "
+        f"by {100 * record.power:g} % of scans like this one, far less in well-known directions; "
         f"{record.systematic_px:g} px are allowed beside the sigmas",
     )
     for note in record.notes:
