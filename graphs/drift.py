@@ -13,7 +13,7 @@ Units, held parameters and the indices of cameras are as in `graphs.propagation`
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -42,6 +42,9 @@ OF_LENS: tuple[Tested, ...] = (*LENS_GROUPS, "lens")
 # What has to be known for `keep`. Groups of a lens may be lost in each other with nothing in the
 # picture lost; all of the lens is not, where a lens has more than one of them.
 DECISIVE: tuple[Tested, ...] = ("lens", "rotation", "translation")
+
+
+LEAST_SHOWN = 1e-3  # of a drift: less is none
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,7 @@ def drift(
     cov_difference: Covariance | None = None,
     n_frames: int | None = None,
     n_frames_old: int | None = None,
+    leaning: Mapping[tuple[str, Group], float] | None = None,
 ) -> Drift:
     """Hold a new calibration against an old one of the same cameras, in the same lenses.
 
@@ -119,7 +123,9 @@ def drift(
     unchanged. cov_difference: of new less old where these are not independent, labelled and in the
     frame as they are; the sum of theirs, where it is not given. n_frames, n_frames_old: on
     which the new and the old covariance rest, which few of them leave in doubt; None: it is known.
-    Raises ValueError where cameras are not the same, in the same order and lenses.
+    leaning: of lens groups, the share of what the new solve knows that is a belief centred on the
+    old calibration: of a drift, so much does not show. Raises ValueError where cameras are not the
+    same, in the same order and lenses.
     """
     criteria = criteria or Criteria()
     _check_alike(old, new)
@@ -135,15 +141,36 @@ def drift(
     apart = changes(old, new, criteria.range, freed, cov_difference, (n_frames_old, n_frames))
     lenses = tuple(of_lenses(apart, criteria.systematic_px))
     places = of_places(apart, criteria.systematic_px, scale_free)
-    first = judged([*lenses, *places.rows()], criteria)
+    hidden = leaning or {}
+    first = _shown(judged([*lenses, *places.rows()], criteria), old, hidden)
     moved, by_lens = _moved(places, first, criteria.alpha)
     # Once it is known which moved, the frame is that of the others: they stay.
-    final = judged([*lenses, *places.rows(moved[0])], criteria) if len(moved) == 1 else first
+    final = first
+    if len(moved) == 1:
+        final = _shown(judged([*lenses, *places.rows(moved[0])], criteria), old, hidden)
     of_pairs = tuple(_pair(old, new, pair, criteria) for pair in pairs(old.estimate))
     result = Drift(old, new, criteria, final, moved, by_lens, scale_free, of_pairs, "replace")
     if any(test.p_corrected < criteria.alpha for test in first):
         return result
     return replace(result, verdict="inconclusive" if result.unresolved else "keep")
+
+
+def _shown(
+    tests: Sequence[GroupDrift], old: Stated, leaning: Mapping[tuple[str, Group], float]
+) -> tuple[GroupDrift, ...]:
+    """With what can be found of what shows: a belief in the old lens pulls the new one to it."""
+
+    def share(test: GroupDrift) -> float:
+        if test.group not in OF_LENS:
+            return 0.0
+        name = old.estimate.cameras[test.cameras[0]].name
+        of = LENS_GROUPS if test.group == "lens" else (test.group,)
+        return max(leaning.get((name, group), 0.0) for group in LENS_GROUPS if group in of)
+
+    return tuple(
+        replace(test, detectable_px=test.detectable_px / max(1 - share(test), LEAST_SHOWN))
+        for test in tests
+    )
 
 
 def _check_alike(old: Stated, new: Stated) -> None:

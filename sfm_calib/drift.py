@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -93,6 +93,7 @@ def judge(
     cov_difference: Covariance | None = None,
     n_frames: int | None = None,
     n_frames_old: int | None = None,
+    leaning: Mapping[tuple[str, Group], float] | None = None,
     notes: Sequence[str] = (),
 ) -> Judged:
     """Hold a new calibration against an old one of the same cameras, lenses and unit of length.
@@ -108,7 +109,7 @@ def judge(
     found = drift(
         old, new, options.criteria(unit),
         scale_free=scale_free, tested=tested, cov_difference=cov_difference, n_frames=n_frames,
-        n_frames_old=n_frames_old,
+        n_frames_old=n_frames_old, leaning=leaning,
     )  # fmt: skip
     said = list(notes)
     if assumed:

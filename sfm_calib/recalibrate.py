@@ -42,7 +42,7 @@ from sfm_calib.config import BaselineConfig, RigConfig
 from sfm_calib.contributions import contributions_of
 from sfm_calib.drift import DriftOptions, judge
 from sfm_calib.drift_record import DriftRecord
-from sfm_calib.drift_sides import part_of, tested_groups, without_lengths
+from sfm_calib.drift_sides import freed_groups, leaning_of, part_of, without_lengths
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
@@ -93,6 +93,7 @@ class Solved:
     covariance: CalibrationCovariance
     split: SplitCheck | None
     prior: PriorRig
+    model: Covariance  # of noise and priors alone, before what is held has its errors
     cov_change: Covariance | None  # of it less the old calibration; None: they are independent
     baseline: BaselineConfig | None  # the old one that gave the metres
     ladder: Ladder | None  # of cameras that the old calibration lacks
@@ -223,14 +224,16 @@ def _solve(
     with watch.stage(f"covariance ({which})"):
         covariance, split = own_covariance_of(refinement, config, progress)
         if not prior.held and mode != "full":
-            return Solved(refinement, covariance, split, prior, None, baseline, ladder)
+            return Solved(
+                refinement, covariance, split, prior, covariance.model, None, baseline, ladder
+            )
         with refusals():
             how = sensitivity(
                 refinement.graph, refinement.estimate, refinement.values, covariance.basis
             )
         cov_change = cov_difference(covariance.stated, how)
-    covariance = with_old_errors(covariance, how)
-    return Solved(refinement, covariance, split, prior, cov_change, baseline, ladder)
+    model, covariance = covariance.model, with_old_errors(covariance, how)
+    return Solved(refinement, covariance, split, prior, model, cov_change, baseline, ladder)
 
 
 def _drift(
@@ -247,7 +250,8 @@ def _drift(
         notes.append(f"only {', '.join(free)} was freed and judged: the rest counts as unchanged")
     # Lengths are compared where each side has metres of its own.
     scale_free = not (given.config.scale.measured and old.unit == "m")
-    tested = set(tested_groups(before, new.prior))
+    fixed = frozenset(f"{n}.{p}" for n, c in given.config.cameras.items() for p in c.fixed)
+    tested = set(freed_groups(before, new.prior, fixed))
     if old.unit is None:  # its cameras are in one place: it says how they are turned
         before, after = without_lengths(before), without_lengths(after)
         tested = {(name, group) for name, group in tested if group != "translation"}
@@ -256,6 +260,7 @@ def _drift(
         scale_free=scale_free, tested=tested,
         cov_difference=new.cov_change, notes=notes,
         n_frames=len(new.refinement.problem.frame_names), n_frames_old=old.rig.n_frames,
+        leaning={} if new.prior.mode == "start" else leaning_of(new.refinement, new.model),
     ).record  # fmt: skip
     return record.model_copy(update={"old_sigma_px": options.old_sigma_px}) if assumed else record
 

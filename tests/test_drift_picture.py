@@ -1,4 +1,4 @@
-"""What an old calibration without sigmas is taken to be right to."""
+"""What an old calibration without sigmas is taken to be right to, and what a belief in it hides."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from test_drift import rig
 
+from graphs.drift import drift
 from graphs.drift_picture import picture, share
+from graphs.drift_tests import Criteria
 
 
 def test_an_assumed_covariance_errs_by_what_is_assumed() -> None:
@@ -23,3 +25,15 @@ def test_an_assumed_covariance_errs_by_what_is_assumed() -> None:
     assert total == pytest.approx(3 / 5 * 0.3**2, rel=0.05)  # weak priors take a little
     assert share(0.3, 3, 5) * 3 == pytest.approx(0.3**2)
     assert not any(name.startswith("cam0.rotation") for name in names)
+
+
+def test_what_a_belief_in_the_old_lens_hides_is_not_called_found() -> None:
+    old = rig("triple")
+    usual = Criteria(depth_ranges=())
+    plain = drift(old, old, usual)
+    hidden = drift(old, old, usual, leaning={("cam1", "distortion"): 0.75})
+    for before, after in zip(plain.tests, hidden.tests, strict=True):
+        of_cam1 = before.cameras == (1,) and before.group in ("distortion", "lens")
+        assert after.detectable_px == pytest.approx((4 if of_cam1 else 1) * before.detectable_px)
+    nothing = drift(old, old, usual, leaning={("cam1", "distortion"): 1.0})
+    assert (plain.verdict, nothing.verdict) == ("keep", "inconclusive")
