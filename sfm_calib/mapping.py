@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,8 +77,9 @@ def map_scan(
         inputs,
         lambda place: run_apart(map_matched, (scan, config, nominal, database, place), progress),
     )
-    scales = colmap.keypoint_scales(database)
-    problem, messages = problem_of(scan, config, lenses, place, database, scales)
+    problem, messages = problem_of(
+        scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
+    )
     return Mapped(problem, messages, hashes)
 
 
@@ -88,15 +89,15 @@ def problem_of(
     lenses: Sequence[LensName],
     place: Path,
     database: Path,
-    scales: dict[str, FloatArray],
+    read_scales: Callable[[], dict[str, FloatArray]],
 ) -> tuple[Problem, tuple[str, ...]]:
     """The rig out of the models in `place`, mapped from `database`, and what was left out.
 
-    scales: as `colmap.keypoint_scales`. Raises CalibrationError when a camera cannot be placed.
+    read_scales: gives them as `colmap.keypoint_scales`. Raises CalibrationError when a camera cannot be placed.
     """
     reference = reference_of(scan, config)
     try:
-        found = colmap.read_models(place)
+        found, scales = colmap.read_models(place), read_scales()
         models = [colmap.free_model(model, scan, lenses, scales) for model in found]
     except (OSError, ValueError) as error:
         raise CalibrationError(f"{place} is damaged: run again with --fresh") from error

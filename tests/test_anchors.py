@@ -62,6 +62,7 @@ def off(scan: Anchored, problem: Problem) -> tuple[np.ndarray, CalibrationCovari
 # ---- in images of its own ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_board_that_two_cameras_see_at_once_gives_metres(scan):
     views = board_views(scan.truth, places_before(6, np.random.default_rng(1)), "abcdef")
     problem, use = joined(scan, apart=views)
@@ -75,6 +76,7 @@ def test_a_board_that_two_cameras_see_at_once_gives_metres(scan):
     assert max(sigma[f"cam1.translation_{axis}"] for axis in "xyz") < 0.05 * baseline_m
 
 
+@pytest.mark.slow
 def test_a_board_that_one_camera_sees_at_a_time_gives_lenses_alone(scan):
     seen_by = {frame: [frame % 2] for frame in range(8)}
     places = places_before(8, np.random.default_rng(2))
@@ -114,6 +116,7 @@ def test_the_scale_of_a_rig_is_that_of_its_board(scan):
 # ---- in the scan ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_board_that_is_waved_in_the_scan(scan):
     views = board_views(scan.truth, places_before(N_FRAMES, np.random.default_rng(3)), NAMES)
     problem, use = joined(scan, views)

@@ -177,6 +177,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(disk)], check=True)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_halfway(small_disk, capfd, monkeypatch):
     monkeypatch.setattr(output, "LEAST_FREE", 0)  # it fills up later than at the start
     out = small_disk / "out"
@@ -200,7 +201,7 @@ def test_results_are_written_both_or_none(tmp_path, monkeypatch, fails):
         raise CalibrationError("cannot write OUT: No space left on device")
 
     monkeypatch.setattr(output, "write_report", lambda *args: args[3].write_text("new"))
-    monkeypatch.setattr(cli, fails, fail)
+    monkeypatch.setattr(output, fails, fail)
     outcome = type("Outcome", (), {"refinement": _Anything(), "calibration": rig(), "unit": 1.0})()
     with pytest.raises(CalibrationError):
         output.write_results(outcome, out, [])

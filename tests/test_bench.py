@@ -81,6 +81,7 @@ def test_colmap_sees_our_residuals(problem: Problem) -> None:
     np.testing.assert_allclose(theirs, by_point, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_all_solvers_end_at_the_same_cost(row: Row) -> None:
     assert abs(row.cost_difference) < 1e-6
     assert row.cost_gtsam == pytest.approx(row.cost, rel=1e-6)
@@ -149,6 +150,7 @@ def test_gtsam_ending_elsewhere_is_reported(row: Row) -> None:
     assert "1,400 observations" in remark and "+1.0e-03" in remark
 
 
+@pytest.mark.slow
 def test_a_solver_that_fails_says_why(tmp_path: Path) -> None:
     stored = tmp_path / "broken.pickle"
     stored.write_bytes(pickle.dumps("no problem"))

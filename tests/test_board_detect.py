@@ -143,6 +143,7 @@ def test_nothing_is_found_where_there_is_nothing(board):
     assert detect(np.full(SIZE[::-1], 128, np.uint8), board) is None
 
 
+@pytest.mark.slow
 def test_large_images_are_refined_at_full_scale():
     image, truth = render(CHECKERBOARD, TILTED, size=(1600, 1200), focal_px=1500.0)
     found = detect(image, CHECKERBOARD)

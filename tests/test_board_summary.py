@@ -201,6 +201,7 @@ def test_of_three_lengths_the_wrong_one_is_named():
     assert "and the square of the board (200 mm): by them it is" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "agree"), [(1.0, True), (1.03, False)])
 def test_a_board_stands_beside_other_lengths(factor, agree):
     calibration = calibrated_with(tape(factor))

@@ -39,6 +39,7 @@ def mapped(scan, place):
     return content, colmap.free_model(models[0], scan, ["radtan"] * 2, scales)
 
 
+@pytest.mark.slow
 def test_tracks_and_models_are_the_same_every_time(tmp_path):
     scan = read_scan(simulation() / "scan", Cache(tmp_path / "cache"), "stem", 10, quiet)
     content, model = mapped(scan, tmp_path / "a")

@@ -72,7 +72,7 @@ def test_three_cameras_go_everywhere_and_come_back(
     assert back.unit == "m"
 
 
-@pytest.mark.parametrize("lens", ["radtan", "kannala_brandt"])
+@pytest.mark.parametrize("lens", ["radtan", pytest.param("kannala_brandt", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("a", "b"), [*product(holding("two", "any"), repeat=2)])
 def test_a_pair_goes_everywhere_and_comes_back(
     a: FormatName, b: FormatName, lens: LensName, tmp_path: Path
@@ -104,6 +104,7 @@ def test_every_lens_is_held_refitted_or_refused(
         assert off == pytest.approx(stated, rel=0.06)  # two digits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("to", DIFFERENT)
 def test_real_files_go_everywhere(to: FormatName, name: str, tmp_path: Path) -> None:

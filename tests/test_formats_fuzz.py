@@ -114,7 +114,7 @@ def test_every_seed_is_a_calibration(which: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("which", SEEDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(data=st.data())
 def test_damaged_files_of_every_format(which: str, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(SEEDS[which])))
@@ -128,7 +128,7 @@ TEXTS = st.text(max_size=200).map(lambda text: text.encode("utf-8", "replace"))
 
 
 @pytest.mark.parametrize("name", ["x.yaml", "x.json", "x.xml", "x.toml", "cameras.bin", "x"])
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(start=st.sampled_from(STARTS), content=st.binary(max_size=300) | TEXTS)
 def test_any_bytes(name: str, start: bytes, content: bytes) -> None:
     with TemporaryDirectory() as folder:

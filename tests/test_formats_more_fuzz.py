@@ -41,7 +41,7 @@ VALID: dict[str, bytes] = {
     "rigs.txt": MODEL["rigs.txt"],
 }
 LONGEST_LINE = 1000  # of an error's message
-fuzzed = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+fuzzed = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 
 
 def valid(rig: CameraRig) -> None:

@@ -96,6 +96,7 @@ def test_moves_are_those_of_a_fresh_solve_without_the_block() -> None:
         assert np.abs(expected / sigma).max() > 0.1  # there was something to find
 
 
+@pytest.mark.slow
 def test_half_of_the_frames_move_by_the_difference_of_the_covariances() -> None:
     """Hausman's lemma over 16 draws of the noise: var(part - all) = var(part) - var(all)."""
     ratios = []

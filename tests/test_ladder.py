@@ -90,12 +90,14 @@ def test_a_radial_lens_is_not_given_tangential_terms(rig: str) -> None:
         np.testing.assert_allclose(found.params[:4], camera.params[:4], atol=3)
 
 
+@pytest.mark.slow
 def test_one_coefficient_is_enough_for_a_lens_of_one() -> None:
     ladder = climbed(scanned("simple_radial", {"k1": K1})[0])
     assert ladder.best.rung == NARROW[0]
     assert "no longer lens" in ladder.reason
 
 
+@pytest.mark.slow
 def test_tangential_terms_are_found_on_a_rig_that_turns() -> None:
     truth = {"k1": K1, "k2": K2, "p1": 2e-3, "p2": -3e-3}
     problem, true = scanned("radtan", truth)
@@ -107,6 +109,7 @@ def test_tangential_terms_are_found_on_a_rig_that_turns() -> None:
         np.testing.assert_allclose(found.params[:4], camera.params[:4], atol=4)
 
 
+@pytest.mark.slow
 def test_a_gain_beyond_chance_but_within_what_features_err_in_common_is_refused() -> None:
     truth = {"k1": K1, "k2": K2, "p1": 3e-4, "p2": -3e-4}
     ladder = climbed(scanned("radtan", truth, sigma_px=0.02)[0])
@@ -117,6 +120,7 @@ def test_a_gain_beyond_chance_but_within_what_features_err_in_common_is_refused(
     assert ladder.best.rung == Rung("radial")
 
 
+@pytest.mark.slow
 def test_k3_is_found_without_tangential_terms() -> None:
     ladder = climbed(scanned("brown", {"k1": K1, "k2": 0.12, "k3": -0.3}, frames=24)[0])
     assert ladder.best.rung == Rung("brown", ("p1", "p2"))

@@ -46,6 +46,7 @@ def with_gain(ladder: Ladder, label: str, gain_px: float) -> Ladder:
     return replace(ladder, rungs=rungs)
 
 
+@pytest.mark.slow
 def test_a_rival_that_does_as_well_is_told_with_what_it_moves(ladder: Ladder) -> None:
     assert ladder.best.rung.label in ("simple_radial", "radial")
     stated = ladder.best.covariance.stated

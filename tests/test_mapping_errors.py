@@ -30,6 +30,7 @@ def good(tmp_path):
     return tmp_path / "scan"
 
 
+@pytest.mark.slow
 def test_a_camera_that_never_registers_is_named(tmp_path, good, capsys):
     for number, path in enumerate(sorted((good / "cam1").iterdir())):
         picture(path, size=(320, 240), seed=number)
@@ -54,6 +55,7 @@ def test_images_that_do_not_overlap(tmp_path, capsys):
     assert not (tmp_path / "out" / "cache" / "matches").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_that_does_not_move(tmp_path, good, capsys):
     (tmp_path / "static").mkdir()
     for number in range(4):

@@ -245,6 +245,7 @@ def test_a_camera_that_is_new_to_the_rig_is_added_with_a_lens_that_fits() -> Non
     np.testing.assert_allclose(calibration.cam_from_rig("cam2").translation, true, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_frame_that_is_asked_for_is_that_of_the_result() -> None:
     calibration = result("reference")
     assert calibration.rig.reference == "cam1"
@@ -287,6 +288,7 @@ def test_metres_of_the_old_calibration_are_called_its_own() -> None:
     assert found("weak").drift.scale_free
 
 
+@pytest.mark.slow
 def test_a_scan_with_metres_of_its_own_judges_the_size() -> None:
     drift = found("measured").drift
     assert drift.verdict == "keep" and not drift.scale_free and drift.notes == ()

@@ -30,6 +30,7 @@ def run(*arguments: object) -> int:
     return main(["recalibrate", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_two_runs_print_and_write_the_same_and_name_what_they_replace(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -142,7 +142,7 @@ OLD = OldFile(path="old.yaml", sha256=HASH, format="Kalibr")
 def recalibrated():
     known = Contribution(old=500.0, sigma_old=None, result=501.0, sigma=0.1, prior_share=0.2)
     record = Recalibration(
-        old=OLD, prior="weak", freed=("intrinsics of left",), kept=("right",), drift="keep",
+        old=OLD, prior="weak", freed=("intrinsics of left",), kept=("right",),
         contributions={"left.fx": known},
     )  # fmt: skip
     right = rig().cameras["right"].model_copy(update={"kept_from": HASH})

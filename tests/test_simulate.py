@@ -125,6 +125,7 @@ def views_of_board(lens: LensName) -> Iterator[tuple[Camera, Transform]]:
         yield camera, world_from_cam.inverse
 
 
+@pytest.mark.slow
 @needs_open3d
 @pytest.mark.parametrize("lens", ["radial", "kannala_brandt"])
 def test_charuco_corners_are_where_the_lens_projects_them(
@@ -172,6 +173,7 @@ def assert_no_bias(errors_px: FloatArray, at_least: int) -> None:
     assert (np.abs(errors_px.mean(0)) < 0.03).all()
 
 
+@pytest.mark.slow
 @needs_open3d
 def test_continued_rays_see_what_cast_rays_see(
     charuco_room: Room, monkeypatch: pytest.MonkeyPatch
@@ -188,6 +190,7 @@ def test_continued_rays_see_what_cast_rays_see(
         assert np.percentile(difference, 99.9) <= 2
 
 
+@pytest.mark.slow
 @needs_open3d
 def test_supersampling_removes_aliases(charuco_room: Room) -> None:
     camera = make_rig("mono", size=(160, 120)).cameras[0]
@@ -328,6 +331,7 @@ def test_missing_open3d_is_one_line_with_the_remedy(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_rig_like_a_calibration(tmp_path):
     pytest.importorskip("open3d", exc_type=ImportError)
     path = simulation() / "truth.json"

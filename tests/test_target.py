@@ -113,6 +113,7 @@ def place_off(found: CamFromRig, true: Transform) -> np.ndarray:
 # ---- one camera --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_lens_is_right_within_its_sigmas(run_of):
     out, _ = run_of(*MONO)
     calibration = load_calibration(out / "calibration.json")
@@ -230,6 +231,7 @@ def test_a_bend_is_estimated_where_it_may_be(stereo):
     assert max(board.sigma_bend_mm) < 0.1 and board.sigma_size == pytest.approx(1e-3, rel=0.01)
 
 
+@pytest.mark.slow
 def test_from_python_it_is_the_same(images, tmp_path, stereo):
     """And of squares that are said to be 2 % larger, the rig is 2 % larger, and no lens changes."""
     larger = CHARUCO.model_copy(update={"square_m": 1.02 * 0.035, "marker_m": 1.02 * 0.026})

@@ -128,6 +128,7 @@ def test_ours_starts_by_pnp_where_the_start_has_no_place(
     assert found.rms_px == pytest.approx(pair.rms_px, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_bent_board_is_found_bent_and_predicts_better() -> None:
     bend = 0.002
     seen, _ = scene(shape=(0.0, bend, 0.0))

@@ -115,6 +115,7 @@ def test_a_twin_that_cannot_be_solved_is_said_so(
         certify(refinement, 3, 0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_rig_without_scale_is_judged_in_its_own_unit() -> None:
     tracks = TRACKS.model_copy(update={"baseline_sigma_m": 0.0})
     problem, _ = simulate_tracks(tracks, np.random.default_rng(3))

@@ -83,6 +83,7 @@ def test_the_worker_leaves_interrupts_to_us():
     assert run(jobs.is_interruptible) == [("SIGINT ignored", 1, 0)]
 
 
+@pytest.mark.slow
 def test_an_interrupt_here_ends_the_worker_at_once():
     pids = []
 
@@ -96,6 +97,7 @@ def test_an_interrupt_here_ends_the_worker_at_once():
     assert not is_alive(pids[0]) and time.monotonic() - begin < 20
 
 
+@pytest.mark.slow
 def test_a_worker_does_not_outlive_us():
     script = (
         "from synthetic import jobs; from sfm_calib.worker import run_apart\n"
