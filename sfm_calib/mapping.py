@@ -93,7 +93,8 @@ def problem_of(
 ) -> tuple[Problem, tuple[str, ...]]:
     """The rig out of the models in `place`, mapped from `database`, and what was left out.
 
-    read_scales: gives them as `colmap.keypoint_scales`. Raises CalibrationError when a camera cannot be placed.
+    read_scales: gives them as `colmap.keypoint_scales`. Raises CalibrationError when a camera
+    cannot be placed.
     """
     reference = reference_of(scan, config)
     try:

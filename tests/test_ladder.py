@@ -90,7 +90,6 @@ def test_a_radial_lens_is_not_given_tangential_terms(rig: str) -> None:
         np.testing.assert_allclose(found.params[:4], camera.params[:4], atol=3)
 
 
-@pytest.mark.slow
 def test_one_coefficient_is_enough_for_a_lens_of_one() -> None:
     ladder = climbed(scanned("simple_radial", {"k1": K1})[0])
     assert ladder.best.rung == NARROW[0]
