@@ -170,6 +170,7 @@ def test_a_standing_board_seen_by_one_camera_gives_metres_by_the_way_past_it(sca
     check_standing(scan, problem, use)
 
 
+@pytest.mark.slow
 def test_a_board_stands_in_the_scan_and_is_seen_apart(scan):
     """Both tell the scale; the images apart come first."""
     apart = board_views(scan.truth, places_before(5, np.random.default_rng(4)), "abcde")
@@ -261,6 +262,7 @@ def test_one_frame_shows_nothing(scan):
 # ---- what the board brought ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_result_says_what_the_scan_alone_does(scan):
     views = board_views(scan.truth, places_before(6, np.random.default_rng(1)), "abcdef")
     calibration = outcome_of(scan, *joined(scan, apart=views)).calibration

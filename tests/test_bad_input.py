@@ -216,6 +216,7 @@ class _Anything:
         return self
 
 
+@pytest.mark.slow
 def test_decoders_leave_the_word_to_us(tmp_path):
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     command = ["calibrate", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "out")]

@@ -69,6 +69,7 @@ def test_a_camera_without_the_board_is_named(tmp_path):
     assert "found in 4 of camera left" in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_another_size_is_named(tmp_path):
     scan = scan_of(tmp_path, {"cam": seen(OTHER)})
     with pytest.raises(CalibrationError) as error:

@@ -132,6 +132,7 @@ def test_a_stereo_pair_of_which_nothing_is_known() -> None:
     np.testing.assert_array_equal(found.cam_from_rig[0].rotation, np.eye(3))
 
 
+@pytest.mark.slow
 def test_four_cameras_in_a_ring_are_chained_around_it() -> None:
     """Opposite cameras never see the board's face at once."""
     rng = np.random.default_rng(1)

@@ -94,6 +94,7 @@ def waved_too(problem: Problem) -> Problem:
     return beside(problem, replace(boards, initial=replace(boards.initial, board_shape=shape)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["still", "waved", "both"])
 def test_normal_equations_are_those_of_finite_differences(which: str) -> None:
     """A step by a column of the inverse makes a gradient of one in that column, and in no other:

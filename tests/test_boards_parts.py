@@ -184,6 +184,7 @@ def test_corners_are_kept_where_one_camera_sees_enough_of_them() -> None:
     assert counts.tolist() == [[6, 3], [4, 6]]
 
 
+@pytest.mark.slow
 def test_no_budget_and_no_lot_takes_corners_away() -> None:
     problem = joint(4, 2, 250)
     known = problem.known[problem.observations.point]

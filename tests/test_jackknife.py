@@ -112,6 +112,7 @@ def test_half_of_the_frames_move_by_the_difference_of_the_covariances() -> None:
     assert 0.7 < np.mean(ratios) < 1.4
 
 
+@pytest.mark.slow
 def test_independent_noise_moves_as_the_model_expects() -> None:
     ratio = []
     for seed in range(4):

@@ -39,6 +39,7 @@ def test_a_camera_that_never_registers_is_named(tmp_path, good, capsys):
     assert "at most 0 matches among its own images and 0 with other cameras" in message
 
 
+@pytest.mark.slow
 def test_a_blank_reference_camera_is_named_and_not_the_good_one(tmp_path, good, capsys):
     for path in (good / "cam0").iterdir():
         blank(path)

@@ -56,6 +56,7 @@ def test_two_runs_print_and_write_the_same_and_name_what_they_replace(
     assert seen[0] == seen[1]
 
 
+@pytest.mark.slow
 def test_the_verdict_is_the_exit_status_where_that_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

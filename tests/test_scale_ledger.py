@@ -145,6 +145,7 @@ def test_what_others_predict_is_what_solving_without_it_finds(index: int, loss: 
         assert abs(found - entry.estimated_m) > 0.02 * sigma_m
 
 
+@pytest.mark.slow
 def test_removing_a_source_by_algebra_leaves_the_ledger_of_the_others() -> None:
     """Through the suspects: of four, two that agree on a wrong length are found by no removal."""
     problem, _ = measured(KINDS)

@@ -149,6 +149,7 @@ def test_charuco_corners_are_where_the_lens_projects_them(
     assert_no_bias(np.concatenate(errors), at_least=60)
 
 
+@pytest.mark.slow
 @needs_open3d
 def test_checkerboard_corners_are_where_the_lens_projects_them() -> None:
     room = build_room(rng(), "checkerboard", texels_per_m=50)

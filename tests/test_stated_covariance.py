@@ -167,6 +167,7 @@ def with_span(problem: Problem) -> Problem:
     return replace(problem, scales=(scale,))
 
 
+@pytest.mark.slow
 def test_clicks_stay_when_their_frames_are_left_out() -> None:
     problem = with_span(problem_of(max_track_frames=6, points=2500))
     graph = build(problem, GraphOptions(SIGMA_PX))

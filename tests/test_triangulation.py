@@ -150,6 +150,7 @@ def test_depth_of_a_stereo_pair_by_hand() -> None:
     assert apart.sigma_depth_calibration == pytest.approx(by_hand / SIGMA_PX)
 
 
+@pytest.mark.slow
 def test_triangulated_covariance_by_drawing_calibrations_and_noise() -> None:
     estimate, point = rig(), np.array([0.3, -0.2, 3.0])
     covariance = covariance_of(estimate, 0.3)

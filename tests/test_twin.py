@@ -85,6 +85,7 @@ def test_every_measured_distance_errs_for_itself(refinement: Refinement) -> None
     assert abs(np.corrcoef(off.T)[0, 1]) < 0.4
 
 
+@pytest.mark.slow
 def test_a_good_scan_is_certified_and_the_same_every_time(refinement: Refinement) -> None:
     told: list[tuple[int, int]] = []
     first = certify(refinement, 4, 0, 1.0, on_trial=lambda *done: told.append(done))

@@ -43,6 +43,7 @@ def test_work_is_done_elsewhere_and_its_progress_is_told_here(tmp_path):
     assert int((tmp_path / "Käm era").read_text()) != os.getpid()
 
 
+@pytest.mark.slow
 def test_errors_come_back_as_they_were():
     with pytest.raises(CalibrationError, match=r"^cam2 matched 3 of 50 frames: scan more slowly$"):
         run(jobs.refuse)

@@ -3,6 +3,7 @@ import pytest
 from experiments.wrong_starts import KINDS, Kind, main
 
 
+@pytest.mark.slow
 def test_a_wrong_start_ends_at_the_optimum(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([Kind("stereo", "radtan", 10, "cauchy")], seeds=2) == [1.0]
     assert "2 of 2" in capsys.readouterr().out
