@@ -12,7 +12,6 @@ from graphs.camera import Camera
 from graphs.compare import Frames, Stated
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
-from graphs.problem import Estimate
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.uncertainty import RANGES, Unit
@@ -52,7 +51,7 @@ def side_by_side(
     for letter, read in (("A", chosen_a), ("B", chosen_b)):
         if is_rig and read.cam_from_rig is None:
             notes += (f"{letter} does not say how its cameras sit: each is compared alone",)
-    states = [_stated(read) for read in (chosen_a, chosen_b)]
+    states = [read.stated for read in (chosen_a, chosen_b)]
     both = chosen_a.cam_from_rig is not None and chosen_b.cam_from_rig is not None
     if not is_rig or not both or min(_spread(s) for s in states) < LEAST_SPREAD:
         alone = tuple((index,) for index in range(len(pairs)))
@@ -181,11 +180,6 @@ def _same_sizes(a: CameraRig, b: CameraRig) -> tuple[CameraRig, CameraRig, tuple
 
 
 # ---- lengths -------------------------------------------------------------------------------
-
-
-def _stated(read: CameraRig) -> Stated:
-    placed = read.cam_from_rig or (Transform.identity(),) * len(read.cameras)
-    return Stated(Estimate(read.cameras, placed, (), np.zeros((0, 3))), read.covariance)
 
 
 def _lenses_alone(side: Stated) -> Stated:

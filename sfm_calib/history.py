@@ -24,7 +24,7 @@ from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.history_files import FoundCalibration, find_calibrations
 from sfm_calib.history_record import GROUPS, Group, History, HistoryEntry, Quantity
-from sfm_calib.partial import reference_of, seen_from, stated_of
+from sfm_calib.partial import reference_of, seen_from
 
 GROUP_OF_SHAPE: dict[str, Group] = {
     "focal": "focal", "focal_x": "focal", "focal_y": "focal",
@@ -225,7 +225,7 @@ def _wide(listed: Sequence[FoundCalibration]) -> frozenset[str]:
 def _numbers(
     one: FoundCalibration, reference: str | None, wide: frozenset[str], options: HistoryOptions
 ) -> Iterator[Number]:
-    side = stated_of(one.read)
+    side = one.read.stated
     wanted = options.camera or one.read.names
     for camera in side.estimate.cameras:
         if camera.name in wanted:

@@ -13,7 +13,7 @@ from graphs.drift_picture import assumed_covariance
 from graphs.lenses import PARAMETER_NAMES, LensName
 from graphs.propagation import lens_names, marginal
 from sfm_calib.formats import CameraRig
-from sfm_calib.partial import reference_of, stated_of
+from sfm_calib.partial import reference_of
 
 
 def lifted(
@@ -25,7 +25,7 @@ def lifted(
     pinhole is 3 % short in focal length, and eight times its sigma. Coefficients that are new are
     zero, right to `sigma_px` in the picture of points at `distance`, where the rest has sigmas.
     """
-    side, notes, new_names = stated_of(rig), [], []
+    side, notes, new_names = rig.stated, [], []
     for index, camera in enumerate(rig.cameras):
         simpler = camera.lens != least and holds(least, camera.lens)
         if not simpler or camera.name not in cameras:

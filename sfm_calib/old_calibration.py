@@ -19,7 +19,7 @@ from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.images import Scan
 from sfm_calib.lifted import lifted
 from sfm_calib.nominal import LONE_LENS, RIG_LENS, lens_said
-from sfm_calib.partial import reference_of, seen_from, stated_of
+from sfm_calib.partial import reference_of, seen_from
 from sfm_calib.prior import checked
 from sfm_calib.uncertainty import Unit
 
@@ -38,7 +38,7 @@ class OldCalibration:
     @property
     def stated(self) -> Stated:
         """Its values with the covariance that it states or is assumed to have."""
-        return stated_of(self.rig)
+        return self.rig.stated
 
     @property
     def own(self) -> Stated:
@@ -104,7 +104,7 @@ def old_calibration(
             notes += told
     if assumed:
         reference = rig.names.index(reference_of(rig))
-        side = seen_from(stated_of(rig), rig.names[reference])
+        side = seen_from(rig.stated, rig.names[reference])
         covariance = assumed_covariance(
             side.estimate, options.old_sigma_px, options.range(unit or "m"), reference
         )

@@ -22,7 +22,6 @@ from graphs.compare import Stated
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.pose_covariance import relative_jacobians, rereferenced
-from graphs.problem import Estimate
 from graphs.propagation import pose_names
 from graphs.unit import in_unit_baseline
 from sfm_calib import result
@@ -82,7 +81,7 @@ def with_missing(
         )
     of_old = reference_of(old)
     reference = reference or (of_old if of_old in new.names else ties[0])
-    sides = tuple(seen_from(stated_of(read), ties[0]) for read in (old, new))
+    sides = tuple(seen_from(read.stated, ties[0]) for read in (old, new))
     pair = _scale_pair(new, old, sides[0], ties) if kept else None
     stated, scale = _joined(sides[0], sides[1], kept, pair, new.unit == "m")
     stated = _ordered(seen_from(stated, reference), (*old.names, *added))
@@ -98,12 +97,6 @@ def reference_of(read: CameraRig) -> str:
         if _is_frame(placed) and set(pose_names(name)).isdisjoint(read.covariance.names):
             return name
     return read.names[0]
-
-
-def stated_of(read: CameraRig) -> Stated:
-    """What was read, for the maths; cameras that sit nowhere sit in one place."""
-    placed = read.cam_from_rig or (Transform.identity(),) * len(read.cameras)
-    return Stated(Estimate(read.cameras, placed, (), np.zeros((0, 3))), read.covariance)
 
 
 def _ties(new: CameraRig, old: CameraRig, unmoved: Sequence[str] | None) -> tuple[str, ...]:

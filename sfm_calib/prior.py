@@ -15,8 +15,6 @@ from dataclasses import replace
 import numpy as np
 
 from graphs.camera import Camera
-from graphs.compare import Stated
-from graphs.frames import Transform
 from graphs.prior_rig import prior_rig
 from graphs.problem import Estimate, PriorMode, PriorRig, Problem
 from graphs.propagation import lens_names, pose_names
@@ -162,13 +160,7 @@ def prior_of(
     shared = [camera for camera in old.cameras if camera.name in cameras]
     loose = freed(free, shared, reference)
     every = freed([ALL], shared, reference)
-    stated = Stated(_estimate(old), old.covariance)
-    return prior_rig(stated, cameras, reference, old.unit == "m", mode, every - loose)
-
-
-def _estimate(old: CameraRig) -> Estimate:
-    placed = old.cam_from_rig or (Transform.identity(),) * len(old.cameras)
-    return Estimate(old.cameras, placed, (), np.zeros((0, 3)))
+    return prior_rig(old.stated, cameras, reference, old.unit == "m", mode, every - loose)
 
 
 def started(problem: Problem, prior: PriorRig) -> Problem:

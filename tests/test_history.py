@@ -22,7 +22,6 @@ from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
 from sfm_calib.history import HistoryOptions, history_of
 from sfm_calib.history_record import History, HistoryEntry, Quantity
-from sfm_calib.partial import stated_of
 from sfm_calib.provenance import Provenance, Replaced
 from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.history import render_history
@@ -100,7 +99,7 @@ def test_what_replaces_what_is_known_by_hash(tmp_path: Path) -> None:
     written(rig_of_day(), tmp_path / "first.json")
     old = calibration_sha256(tmp_path / "first.json")
     (tmp_path / "first.json").rename(tmp_path / "moved.json")
-    drift = judge(stated_of(rig_of_day()), stated_of(rig_of_day(1)), "m", WITHOUT_DEPTHS).record
+    drift = judge(rig_of_day().stated, rig_of_day(1).stated, "m", WITHOUT_DEPTHS).record
     recalibration = Recalibration(
         old=OldFile(path="first.json", sha256=old, format="ours"), prior="full", freed=("all",),
         kept=("d",), drift=drift.model_copy(update={"verdict": "replace"}),
@@ -186,7 +185,7 @@ def test_changes_are_in_combined_sigmas(tmp_path: Path) -> None:
 def test_another_reference_is_the_same_rig(tmp_path: Path) -> None:
     rig = rig_of_day()
     written(rig, tmp_path / "1.json", 0)
-    estimate, covariance = rereferenced(stated_of(rig).estimate, rig.covariance, 2)
+    estimate, covariance = rereferenced(rig.stated.estimate, rig.covariance, 2)
     other = CameraRig(
         rig.path, rig.format, estimate.cameras, estimate.cam_from_rig, "m", covariance
     )

@@ -21,7 +21,7 @@ from graphs.propagation import lens_names, marginal, pose_names
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import CameraRig, LengthUnit
 from sfm_calib.formats.ours import rig_of
-from sfm_calib.partial import Completed, completed, in_longest_baseline, stated_of, with_missing
+from sfm_calib.partial import Completed, completed, in_longest_baseline, with_missing
 from sfm_calib.recalibration_record import OldFile, Recalibration
 from sfm_calib.report.rows import camera_tables
 from sfm_calib.result import CameraResult, CamFromRig, Verdict, load_calibration, save_calibration
@@ -60,7 +60,7 @@ def uncertain(rig: CameraRig, reference: str, seed: int, sigma: float = 1e-4) ->
 
 def erring(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
     """With an error of its covariance."""
-    root = Stated(stated_of(rig).estimate, rig.covariance).root
+    root = Stated(rig.stated.estimate, rig.covariance).root
     return off_by(rig, root @ rng.normal(size=len(rig.covariance.names)))
 
 
@@ -79,7 +79,7 @@ def off_by(rig: CameraRig, error: FloatArray) -> CameraRig:
 
 def in_baseline(rig: CameraRig) -> CameraRig:
     """The longest baseline from the reference 1 long, and of no sigma."""
-    side = in_longest_baseline(stated_of(rig))
+    side = in_longest_baseline(rig.stated)
     placed, covariance = side.estimate.cam_from_rig, side.covariance
     return replace(rig, cam_from_rig=placed, covariance=covariance, unit="baseline")
 
@@ -131,8 +131,7 @@ def test_kept_cameras_are_untouched_in_olds_frame(seed: int, order: list[str]) -
         if name in missing:
             assert found.stated.estimate.cameras[index] is old.cameras[index]
             assert (
-                found.stated.estimate.cam_from_rig[index]
-                is stated_of(old).estimate.cam_from_rig[index]
+                found.stated.estimate.cam_from_rig[index] is old.stated.estimate.cam_from_rig[index]
             )
 
 
@@ -140,7 +139,7 @@ def test_solved_cameras_are_the_scans_own_in_olds_frame() -> None:
     old = uncertain(true_rig(NAMES, "a"), "a", 1)
     new = uncertain(true_rig(("b", "a"), "b"), "b", 2)
     found = with_missing(new, old)
-    placed, covariance = rereferenced(stated_of(new).estimate, new.covariance, 1)
+    placed, covariance = rereferenced(new.stated.estimate, new.covariance, 1)
     np.testing.assert_array_equal(
         found.stated.estimate.cam_from_rig[1].rotation, placed.cam_from_rig[0].rotation
     )
@@ -177,9 +176,7 @@ def test_kept_cameras_follow_the_tie_and_not_the_camera_that_moved() -> None:
         (placed[3] @ placed[2].inverse).rotation,
         (old.cam_from_rig[3] @ old.cam_from_rig[2].inverse).rotation,
     )
-    was, now = (
-        relative(s.covariance, s.estimate, 3, 2).matrix for s in (stated_of(old), found.stated)
-    )
+    was, now = (relative(s.covariance, s.estimate, 3, 2).matrix for s in (old.stated, found.stated))
     np.testing.assert_allclose(now, was, atol=1e-12 * np.abs(was).max() + 1e-16)
 
 

@@ -27,7 +27,7 @@ from sfm_calib import recalibrate as story
 from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import read_calibration
 from sfm_calib.formats.reading import CameraRig
-from sfm_calib.partial import reference_of, seen_from, stated_of
+from sfm_calib.partial import reference_of, seen_from
 from sfm_calib.recalibrate import Recalibrated
 from sfm_calib.result import Calibration
 
@@ -214,7 +214,7 @@ def test_without_olds_reference_the_frame_is_another_cameras() -> None:
     calibration = result("lacks cam0")
     assert calibration.rig.reference == "cam1" and calibration.rig.metric
     assert found("lacks cam0").drift.cameras == ("cam1", "cam2")
-    old = seen_from(stated_of(deployed()), "cam1")
+    old = seen_from(deployed().stated, "cam1")
     np.testing.assert_allclose(
         calibration.cam_from_rig("cam0").translation,
         old.estimate.cam_from_rig[0].translation,
@@ -263,7 +263,7 @@ def test_kept_cameras_stay_beside_the_reference_where_that_has_not_moved(
 ) -> None:
     """cam1 is the reference and not the first by name; cam2 has moved, and nothing is lost."""
     old = moved(deployed(), "cam2", turn_deg=1.0)
-    at_cam1 = seen_from(stated_of(old), "cam1")
+    at_cam1 = seen_from(old.stated, "cam1")
     fourth = replace(old.cameras[2], name="cam3")
     placed = (*at_cam1.estimate.cam_from_rig, at_cam1.estimate.cam_from_rig[0])
     rig = replace(

@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from graphs.camera import Camera
+from graphs.compare import Stated
 from graphs.covariance import NOTHING, Covariance
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
@@ -54,6 +55,12 @@ class CameraRig:
     @property
     def states_sigmas(self) -> bool:
         return bool(np.diag(self.covariance.matrix).any())
+
+    @property
+    def stated(self) -> Stated:
+        """For the maths; cameras that sit nowhere sit in one place."""
+        placed = self.cam_from_rig or (Transform.identity(),) * len(self.cameras)
+        return Stated(Estimate(self.cameras, placed, (), np.zeros((0, 3))), self.covariance)
 
     def checked(self) -> CameraRig:
         """Itself. Raises CalibrationError for names, sizes and numbers that no camera has."""
@@ -124,8 +131,7 @@ class CameraRig:
         ]
         if at_origin:
             return self, at_origin[0]
-        estimate = Estimate(self.cameras, rig, (), np.zeros((0, 3)))
-        new, covariance = rereferenced(estimate, self.covariance, 0)
+        new, covariance = rereferenced(self.stated.estimate, self.covariance, 0)
         return replace(self, cam_from_rig=new.cam_from_rig, covariance=covariance), 0
 
     def calibration(self) -> Calibration:
@@ -179,14 +185,9 @@ class CameraRig:
         """The same, its unit of length being so many metres."""
         if self.cam_from_rig is None:
             return self
-        by = np.array([metres if ".translation_" in n else 1.0 for n in self.covariance.names])
-        matrix = self.covariance.matrix * by[:, None] * by
-        return replace(
-            self,
-            cam_from_rig=tuple(t.scaled(metres) for t in self.cam_from_rig),
-            covariance=Covariance(self.covariance.names, matrix),
-            unit="m",
-        )
+        side = self.stated.scaled(metres)
+        placed = side.estimate.cam_from_rig
+        return replace(self, cam_from_rig=placed, covariance=side.covariance, unit="m")
 
 
 def image_size(name: str, width: object, height: object) -> tuple[int, int]:
