@@ -12,7 +12,7 @@ DEVLOCK := requirements/dev.lock
 UV      := uv==0.13.9
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all check bench venv learned cluster lock clean
+.PHONY: help demo test test-all check bench venv learned lock clean
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -46,9 +46,6 @@ $(STAMP): pyproject.toml $(DEVLOCK) scripts/make_venv.sh
 learned: $(STAMP) ## add torch and kornia to .venv (large)
 	@$(BIN)/python -m pip install -r requirements/learned.lock
 
-cluster: $(STAMP) ## add dask to .venv
-	@$(BIN)/python -m pip install -r requirements/cluster.lock
-
 # The locks hold one version of each package for all of Python 3.11 to 3.14. To take newer
 # releases, run `make lock UPGRADE=--upgrade`; without it, pins that still fit stay as they are.
 COMPILE := .venv-lock/bin/uv pip compile --quiet --universal --fork-strategy fewest \
@@ -58,10 +55,9 @@ COMPILE := .venv-lock/bin/uv pip compile --quiet --universal --fork-strategy few
 lock: ## resolve requirements/*.lock anew from pyproject.toml
 	@test -x .venv-lock/bin/python || "$(PYTHON)" -m venv .venv-lock
 	@.venv-lock/bin/python -m pip install -qq "$(UV)"
-	$(COMPILE) pyproject.toml --extra depth --extra dev -o $(DEVLOCK) >/dev/null
+	$(COMPILE) pyproject.toml --extra depth --extra studies --extra cluster --extra dev -o $(DEVLOCK) >/dev/null
 	$(COMPILE) requirements/learned.in -c $(DEVLOCK) -o requirements/learned.lock \
 	  $$(sed -n 's/^#omit /--no-emit-package /p' requirements/learned.in) >/dev/null
-	$(COMPILE) pyproject.toml --extra cluster -c $(DEVLOCK) -o requirements/cluster.lock >/dev/null
 
 clean: ## remove .venv, out and every cache
 	rm -rf $(VENV) .venv-lock out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

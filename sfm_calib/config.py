@@ -280,10 +280,15 @@ def error_text(error: Exception) -> str:
     return (str(getattr(error, "problem", None) or error).splitlines() or [""])[0]
 
 
-def first_problem(error: ValidationError, spell: Callable[[str], str] = str) -> str:
+def first_problem(
+    error: ValidationError,
+    spell: Callable[[str], str] = str,
+    model: type[BaseModel] | None = None,
+) -> str:
     """The first validation error as one line, with the nearest valid name for an unknown key.
 
-    `spell` turns a key into what the user wrote, such as a flag.
+    `spell` turns a key into what the user wrote, such as a flag; model: what was validated, where
+    it is neither a RigConfig nor nested.
     """
     problems = error.errors()
     # A misspelt key is often also a missing one; the misspelling is what to tell.
@@ -291,7 +296,7 @@ def first_problem(error: ValidationError, spell: Callable[[str], str] = str) -> 
     problem = next(unknown, problems[0])
     where = spell(".".join(str(part) for part in problem["loc"]))
     if problem["type"] == "extra_forbidden":
-        names = _valid_names(problem["loc"])
+        names = sorted(model.model_fields) if model else _valid_names(problem["loc"])
         close = difflib.get_close_matches(str(problem["loc"][-1]), names, n=1, cutoff=0.0)
         hint = f"did you mean {close[0]!r}? " if close else ""
         return f"unknown key {where!r}: {hint}Valid here: {', '.join(names)}"
