@@ -21,6 +21,7 @@ from sfm_calib.report.theme import Panel, figure_html, page_template, styled
 PACKAGE = "experiments.runner"
 MOST_ROWS = 1000  # of a table: a browser lays out 10,000 in seconds, and nobody reads them
 OPEN_ROWS = 30  # a longer table scrolls in a box of its own
+MUCH = 40  # characters of a cell, which is broken beyond
 DEFAULT_HEIGHT = 380
 SMALL = 480  # pixels: two such figures go side by side on a wide screen
 BANNERS = {"as expected": "good", "not as expected": "bad", "no verdict": "doubtful"}
@@ -56,6 +57,7 @@ def render_page(answered: Answered) -> str:
         title=f"{record.study}: {record.question}",
         record=record,
         paragraphs=answered.said.paragraphs,
+        much=MUCH,
         banner=BANNERS[record.said],
         figures=figure_groups(answer),
         tables=[
@@ -63,7 +65,9 @@ def render_page(answered: Answered) -> str:
             for table, file in zip(answer.tables, table_files(answer), strict=True)
         ],
         command=answered.said.command,
-        config=yaml.safe_dump(record.config, sort_keys=False, allow_unicode=True),
+        config=yaml.safe_dump(
+            record.config, sort_keys=False, allow_unicode=True, default_flow_style=None
+        ),
         provenance=provenance(record.origin),
         plotly_js=Markup(get_plotlyjs()),
     )

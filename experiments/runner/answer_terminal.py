@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 
 from experiments.runner.cells import column_texts, is_numeric
@@ -12,10 +12,9 @@ from experiments.runner.protocol import AnswerTable
 from experiments.runner.verdict import Answered, Failure, Verdict, table_files
 from sfm_calib.terminal import print_line
 
-MOST_ROWS = 40  # more than a screen is read in the page or the CSV
+MOST_ROWS = 60  # more than a screen is read in the page or the CSV
 MOST_FAILURES = 8
 WIDEST_TEXT = 40  # characters of a column of words, before it is folded
-LEAST_TEXT = 12
 BORDER = 3  # characters a column takes beside its text
 STYLES = {"as expected": "bold green", "not as expected": "bold red", "no verdict": "bold yellow"}
 
@@ -52,7 +51,7 @@ def print_failures(record: Verdict, console: Console) -> None:
 def failure_text(failure: Failure) -> str:
     """One way of failing, in a line."""
     first = "first: " if failure.count > 1 else ""
-    return f"{failure.count}x {failure.error!r} ({first}{failure.first})"
+    return f"{failure.count}x {failure.ending}: {failure.error!r} ({first}{failure.first})"
 
 
 def tables_of(table: AnswerTable, width: int) -> list[Table]:
@@ -60,35 +59,28 @@ def tables_of(table: AnswerTable, width: int) -> list[Table]:
 
     Every part begins with the columns that tell the rows apart.
     """
-    texts = [column_texts([row[k] for row in table.rows]) for k in range(len(table.columns))]
-    numeric = [is_numeric([row[k] for row in table.rows]) for k in range(len(table.columns))]
-    taken = [
-        _width(title, column, number)
-        for title, column, number in zip(table.columns, texts, numeric, strict=True)
+    cells = [[row[k] for row in table.rows] for k in range(len(table.columns))]
+    texts = [column_texts(column) for column in cells]
+    numeric = [is_numeric(column) for column in cells]
+    longest = [max(map(len, column), default=0) for column in texts]
+    words = [max(map(len, title.split()), default=0) for title in table.columns]
+    least = [
+        max(word, long if number else min(long, WIDEST_TEXT), 1)
+        for word, long, number in zip(words, longest, numeric, strict=True)
     ]
     parts = []
-    for columns in column_parts(taken, _leading(table), width - 1):
+    for columns in column_parts([one + BORDER for one in least], _leading(table), width - 1):
+        spare = max(width - 1 - sum(least[k] + BORDER for k in columns), 0)
         shown = Table()
         for k in columns:
-            words = not numeric[k]
-            shown.add_column(
-                table.columns[k],
-                justify="left" if words else "right",
-                no_wrap=not words,
-                overflow="fold",
-                min_width=None if words else max(map(len, texts[k]), default=0),
-            )
+            more = min(spare, max(longest[k], len(table.columns[k])) - least[k])
+            spare -= more
+            side: JustifyMethod = "right" if numeric[k] else "left"
+            shown.add_column(table.columns[k], justify=side, overflow="fold", width=least[k] + more)
         for row in range(min(len(table.rows), MOST_ROWS)):
             shown.add_row(*(texts[k][row] for k in columns))
         parts.append(shown)
     return parts
-
-
-def _width(title: str, texts: Sequence[str], numeric: bool) -> int:
-    """Characters that a column needs to be read, its border among them."""
-    word = max((len(one) for one in title.split()), default=0)
-    longest = max((len(text) for text in texts), default=0)
-    return BORDER + max(word, longest if numeric else min(longest, WIDEST_TEXT))
 
 
 def _leading(table: AnswerTable) -> int:

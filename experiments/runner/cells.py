@@ -12,7 +12,7 @@ from experiments.runner.protocol import AnswerTable
 
 NOTHING = "–"
 DIGITS = 4  # of the largest number of a column
-FEWEST_DIGITS = 2  # of the smallest
+FEWEST_DIGITS = 1  # of the smallest
 WIDEST = 1e7  # beyond it, and where digits of the smallest would be more decimals than
 MOST_DECIMALS = 6  # these, each number is written by itself: as a power of ten at need
 

@@ -19,6 +19,7 @@ from experiments.runner.registry import about, study_of
 from experiments.runner.rows import (
     ROWS_FOLDER,
     STUDY_FILE,
+    Ending,
     Results,
     StoredRow,
     read_results,
@@ -40,6 +41,7 @@ class Failure(Record):
     error: str  # of the first
     count: int
     first: str  # its seed, and what of its options was swept
+    ending: Ending
     traceback: str | None
 
 
@@ -48,7 +50,8 @@ class Counts(Record):
 
     asked: int
     finished: int  # those that failed among them
-    failed: int
+    failed: int  # in whatever way
+    broken: int  # by the machine, those of them
     elsewhere: int  # rows of the folder that this config does not ask for
 
 
@@ -110,6 +113,7 @@ def answered(folder: Path) -> Answered:
         asked=len(results.trials),
         finished=len(stored),
         failed=sum(one.error is not None for one in stored),
+        broken=sum(one.ending == "broken" for one in stored),
         elsewhere=max(there - len(stored), 0),
     )
     origin = _origin(stored)
@@ -161,16 +165,17 @@ def table_files(answer: Answer) -> list[str]:
 
 def _failures(results: Results) -> tuple[Failure, ...]:
     """The ways in which trials failed, the most frequent first."""
-    ways: dict[str, list[tuple[Trial, StoredRow]]] = {}
+    ways: dict[tuple[str, str], list[tuple[Trial, StoredRow]]] = {}
     for trial in results.trials:
         one = results.finished.get(trial.key)
         if one is not None and one.error is not None:
-            ways.setdefault(NUMBER.sub("#", one.error), []).append((trial, one))
+            ways.setdefault((one.ending, NUMBER.sub("#", one.error)), []).append((trial, one))
     found = [
         Failure(
             error=rows[0][1].error or "",
             count=len(rows),
             first=swept_text(results.config, rows[0][0]),
+            ending=rows[0][1].ending,
             traceback=rows[0][1].traceback,
         )
         for rows in ways.values()
@@ -218,6 +223,11 @@ def _warnings(folder: Path, counts: Counts, origin: Origin) -> list[str]:
                 f"{counts.elsewhere} more rows in {folder / ROWS_FOLDER} are of another config, "
                 "another version or other inputs, and do not count"
             )
+    if counts.broken:
+        found.append(
+            f"{counts.broken} trials were broken off by the machine, which says nothing of them; "
+            f"run again with: {again(folder)}"
+        )
     mixed = {"versions of sfm_calib": origin.versions, "states of the code": origin.git}
     mixed |= {f"versions of {name}": held for name, held in origin.libraries.items()}
     for what, held in mixed.items():
@@ -226,8 +236,8 @@ def _warnings(folder: Path, counts: Counts, origin: Origin) -> list[str]:
             found.append(f"rows come from {len(held)} {what}: {listed}")
     if dirty := sum(count for state, count in origin.git.items() if state.endswith(DIRTY)):
         found.append(
-            f"{dirty} of {counts.finished} rows come from code that was changed and not committed: "
-            "they cannot be made again from any commit"
+            f"{dirty} of {counts.finished} rows: their code was changed and not committed, so that "
+            "no commit makes them again"
         )
     return found
 
