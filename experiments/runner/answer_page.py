@@ -14,6 +14,7 @@ from plotly.offline import get_plotlyjs
 
 from experiments.runner.cells import column_texts, is_numeric
 from experiments.runner.protocol import Answer, AnswerFigure, AnswerTable
+from experiments.runner.run_command import duration
 from experiments.runner.verdict import Answered, Origin, table_files
 from sfm_calib.files import write_atomically
 from sfm_calib.report.theme import Panel, figure_html, page_template, styled
@@ -25,7 +26,6 @@ MUCH = 40  # characters of a cell, which is broken beyond
 DEFAULT_HEIGHT = 380
 SMALL = 480  # pixels: two such figures go side by side on a wide screen
 BANNERS = {"as expected": "good", "not as expected": "bad", "no verdict": "doubtful"}
-MINUTE, HOUR = 60.0, 3600.0
 TIME = "%Y-%m-%d %H:%M:%S UTC"
 
 
@@ -141,12 +141,3 @@ def _counted(held: Mapping[str, int]) -> str:
 
 def _span(ends: Sequence[str]) -> str:
     return " to ".join(dict.fromkeys(ends))
-
-
-def duration(seconds: float) -> str:
-    """A time that a person can read."""
-    if seconds < MINUTE:
-        return f"{seconds:.3g} s"
-    if seconds < HOUR:
-        return f"{seconds / MINUTE:.1f} min"
-    return f"{seconds / HOUR:.1f} h"

@@ -38,6 +38,11 @@ def plain_value(cell: Any) -> Any:
     return cell.item() if hasattr(cell, "item") else cell
 
 
+def one_line(text: str) -> str:
+    """Any text as a line that a file can hold: names of files need not be UTF-8."""
+    return " ".join(text.encode("utf-8", "replace").decode().split())
+
+
 def is_numeric(cells: Sequence[Any]) -> bool:
     """Whether a column holds nothing but numbers, and some."""
     values = [plain_value(cell) for cell in cells]
@@ -60,7 +65,7 @@ def _text(value: Any, decimals: int | None) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if not isinstance(value, float):
-        return " ".join(str(value).encode("utf-8", "replace").decode().split())
+        return one_line(str(value))
     if not math.isfinite(value):
         return str(value)
     return f"{value:.{DIGITS}g}" if decimals is None else f"{value:.{decimals}f}"

@@ -13,6 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from experiments.runner.cells import one_line
 from experiments.runner.docstring import Said, said
 from experiments.runner.protocol import Answer
 from experiments.runner.registry import about, study_of
@@ -121,11 +122,11 @@ def answered(folder: Path) -> Answered:
     record = Verdict(
         study=results.config.study,
         question=words.question,
-        verdict=" ".join(answer.verdict.split()),
+        verdict=one_line(answer.verdict),
         holds=holds,
         said={True: "as expected", False: "not as expected", None: "no verdict"}[holds],
         trials=counts,
-        warnings=tuple(_warnings(folder, counts, origin)),
+        warnings=tuple(map(one_line, _warnings(folder, counts, origin))),
         failures=_failures(results),
         tables=tuple(table_files(answer)),
         config=results.config.model_dump(mode="json", exclude_defaults=True),
