@@ -62,10 +62,6 @@ class AveragingOptions(TrialOptions):
     shape: LensShape = "barrel"
     """Distortion of both lenses."""
 
-    @property
-    def said(self) -> str:
-        return f"{self.frames} frames, {self.baseline_m:g} m, {self.focal_px:g} px"
-
 
 # ---- one calibration -----------------------------------------------------------------------
 
@@ -104,7 +100,7 @@ def trial(options: AveragingOptions, seed: int) -> Row:
     for measure in MEASURES:
         true, floor, drawn = (_measured(measure, p) for p in (ends, told.points, measured))
         stated, off = splits[measure], floor - true
-        row[f"{measure}_square"] = _squares_of_means(drawn - true).ravel().tolist()
+        row[f"{measure}_square"] = squares_of_means(drawn - true).ravel().tolist()
         row[f"{measure}_noise"] = stated.noise.mean(1).tolist()
         row[f"{measure}_calibration"] = stated.calibration.mean(1).tolist()
         row[f"{measure}_floor"] = (off**2).sum(-1).mean(1).tolist()
@@ -121,7 +117,7 @@ def _measured(measure: Measure, ends: FloatArray) -> FloatArray:
     return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1, keepdims=True)
 
 
-def _squares_of_means(off: FloatArray) -> FloatArray:
+def squares_of_means(off: FloatArray) -> FloatArray:
     """Mean square (ranges, counts) of means of N of the errors (REPEATS, ranges, places, k).
 
     All means of N that do not overlap, but for what does not fill one.
@@ -185,14 +181,22 @@ def answer(trials: Sequence[Finished[AveragingOptions]]) -> Answer:
     if not done:
         return Answer("no trial was finished", None)
     curves: list[Curve] = []
-    for options in dict.fromkeys(t.options for t in done):
+    kinds = list(dict.fromkeys(t.options for t in done))
+    for options, name in zip(kinds, _names(kinds), strict=True):
         rows = [t.row for t in done if t.options == options]
-        curves += [curve_of(options.said, measure, rows) for measure in MEASURES]
+        curves += [curve_of(name, measure, rows) for measure in MEASURES]
     holds = judged(curves)
     word = {True: "yes", False: "no", None: "too few trials to say"}[holds]
     failed = len(trials) - len(done)
     lost = f"; {failed} of {len(trials)} trials failed" if failed else ""
     return Answer(f"{word}: {in_words(curves)}{lost}", holds, tables(curves), figures(curves))
+
+
+def _names(kinds: Sequence[AveragingOptions]) -> list[str]:
+    """What tells each from the others; of one alone, its frames."""
+    every = [one.model_dump() for one in kinds]
+    told = [key for key in every[0] if len({one[key] for one in every}) > 1] or ["frames"]
+    return [", ".join(f"{key} {one[key]}" for key in told) for one in every]
 
 
 STUDY = Study(AveragingOptions, trial, answer)

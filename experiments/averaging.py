@@ -106,29 +106,32 @@ def broken(curve: Curve) -> list[str]:
 
 
 def in_words(curves: Sequence[Curve]) -> str:
-    """The numbers that decide, in one line: those of a depth at the middle range, and the worst."""
+    """The numbers that decide, in one line: depths at the middle range, and the worst of all."""
+    most = f"{curves[0].counts[-1]:.0f}"
     said = []
     for c in curves:
         if c.measure != "depth":
             continue
         r = len(c.ranges_m) // 2
-        one, most = 1e3 * c.rmse_m[r, 0], 1e3 * c.rmse_m[r, -1]
+        before, after = 1e3 * c.rmse_m[r, 0], 1e3 * c.rmse_m[r, -1]
         alone = 1e3 * c.noise_m[r] / c.counts[-1] ** 0.5
         said.append(
-            f"{c.of}: {c.counts[-1]:.0f} measurements of a depth of {c.ranges_m[r]:g} m err by "
-            f"{most:.2g} mm, one by {one:.2g} (noise alone would leave {alone:.2g}), "
-            f"N* {in_digits(c.nstar[r], 0)} (predicted {c.nstar_predicted[r]:.0f})"
+            f"{c.of}: {most} measurements of a depth of {c.ranges_m[r]:g} m leave {after:.2g} of "
+            f"{before:.2g} mm (noise alone would leave {alone:.2g}), averaging pays to N* "
+            f"{in_digits(c.nstar[r], 0)} (predicted {c.nstar_predicted[r]:.0f})"
         )
-    for n, counts in ((0, "one"), (-1, f"{curves[0].counts[-1]:.0f}")):
-        values = [c.ratio[n] for c in curves]
-        low, high = min(values), max(values)
-        said.append(f"RMSE over predicted of {counts} {in_digits(low, 2)} to {in_digits(high, 2)}")
-    nees = [c.nees for c in curves]
-    said.append(f"NEES of the floor {in_digits(min(nees), 2)} to {in_digits(max(nees), 2)}")
+    for n, count in ((0, "one"), (-1, most)):
+        said.append(f"RMSE over predicted {_range([c.ratio[n] for c in curves])} for {count}")
+    said.append(f"NEES of the floor {_range([c.nees for c in curves])}")
     wrong = [f"{c.measure} ({c.of}): {', '.join(b)}" for c in curves if (b := broken(c))]
     if wrong:
         said.append(f"not as predicted: {'; '.join(wrong)}")
     return "; ".join(said)
+
+
+def _range(values: Sequence[Value]) -> str:
+    low, high = (of(values, key=lambda value: value[0]) for of in (min, max))
+    return in_digits(low) if low == high else f"{in_digits(low)} to {in_digits(high)}"
 
 
 # ---- tables and figures --------------------------------------------------------------------

@@ -31,7 +31,7 @@ EFFECTS: tuple[Effect, ...] = get_args(Effect)
 # What errs, by one sigma: about what a short scan leaves, and small enough for first order.
 FOCAL = 0.002  # of the focal length
 K1 = 0.0005
-BASELINE = 0.002  # of the baseline
+BASELINE = 0.001  # of the baseline
 ROTATION_DEG = 0.02
 
 DEPTHS_M = np.geomspace(1.0, 8.0, 8)
