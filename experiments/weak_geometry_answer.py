@@ -71,7 +71,8 @@ def answer(trials: Sequence[Finished[Any]]) -> Answer:
         return Answer(f"none of {len(trials)} trials was finished", None)
     standings = [standing(solver, judged) for solver in TITLES]
     unsaid = [t for t in calibrated if goes_unsaid(t.row)]
-    holds = _holds(standings, calibrated, unsaid)
+    reached = max((t.row["condition"] for t in judged), default=0.0)
+    holds = _holds(standings, reached, calibrated, unsaid)
     word = {True: "yes", False: "no", None: "too few trials to say"}[holds]
     failed = len(trials) - len(done)
     words = [*_in_words(standings), _of_calibrations(calibrated, unsaid)]
@@ -134,12 +135,18 @@ def _cases(trials: Trials) -> Iterator[tuple[tuple[str, str], list[Solved]]]:
         yield case, list(some)
 
 
-def _holds(standings: Sequence[Standing], calibrated: Trials, unsaid: Trials) -> bool | None:
+def _holds(
+    standings: Sequence[Standing], reached: float, calibrated: Trials, unsaid: Trials
+) -> bool | None:
+    """reached: the largest condition tried."""
     of = {one.solver: one for one in standings}
-    kept = []
+    kept: list[bool | None] = []
     for solver, lost in LOST.items():
         found, p = of[solver].typical, of[solver].power
-        kept.append(None if found is None else bool(abs(np.log10(found / lost)) <= DECADES))
+        if found is not None:
+            kept.append(bool(abs(np.log10(found / lost)) <= DECADES))
+        else:
+            kept.append(False if reached > lost * 10**DECADES else None)
         kept.append(None if p is None else abs(p - GROWS[solver]) <= POWER_WITHIN)
     kept.append(of["ours"].silent == 0 if of["ours"].trials else None)
     kept.append(not unsaid if calibrated else None)
@@ -212,22 +219,31 @@ def _figures(judged: Trials) -> Iterator[AnswerFigure]:
     for (motion, lens), some in _cases(judged):
         series = []
         for solver, title in TITLES.items():
-            points = [
-                (t.row["condition"], max(t.row[f"{solver}_sigma_error"], EPS))
-                for t in some
-                if t.row[f"{solver}_sigma_error"] is not None
-            ]
+            points = list(_line(some, solver))
             if len(points) >= FEWEST:
-                x, y = zip(*sorted(points), strict=True)
+                x, y = zip(*points, strict=True)
                 series.append(Series(title, x, y))
         if series:
             figure = lines(
                 series, "cond(J)", "relative error of the worst sigma", log_x=True, log_y=True,
                 level=WRONG,
             )  # fmt: skip
+            figure.update_xaxes(exponentformat="power")
+            figure.update_yaxes(exponentformat="power")
             yield AnswerFigure(
                 f"{motion}_{lens}",
                 f"{motion}, {lens}",
-                "A line ends where the solver refuses. Above the dotted line sigmas are wrong.",
+                "Medians of those that were not refused: a line ends where all are. Above the "
+                "dotted line sigmas are wrong.",
                 figure,
             )
+
+
+def _line(some: Trials, solver: str) -> Iterator[tuple[float, float]]:
+    """Median condition and error at each scale."""
+    for scale in sorted({t.options.scale for t in some}, reverse=True):
+        rows = [t.row for t in some if t.options.scale == scale]
+        errors = [e for row in rows if (e := row[f"{solver}_sigma_error"]) is not None]
+        if errors:
+            condition = statistics.median(row["condition"] for row in rows)
+            yield condition, max(statistics.median(errors), EPS)
