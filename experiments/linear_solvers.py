@@ -21,8 +21,8 @@ from graphs.frames import FloatArray
 from graphs.influence import responses
 from graphs.keys import lens_key
 from graphs.reference import ReferenceGraph, native_slots
-from graphs.solve import threads
 from graphs.system import System, assemble
+from graphs.threads import threads
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,8 @@ def answer(trials: Trials) -> Answer:
     word = {True: "yes", False: "no", None: "too few scans to say"}[holds]
     words = (_of_costs(groups), _of_default(groups), _of_regret(groups), _of_breaking(groups))
     said = "; ".join(one for one in words if one)
-    return Answer(f"{word}: {said}", holds, (_table(groups),), tuple(_figures(groups)))
+    tables = (_choice(groups), _table(groups))
+    return Answer(f"{word}: {said}", holds, tables, tuple(_figures(groups)))
 
 
 # ---- summaries -----------------------------------------------------------------------------
@@ -143,7 +144,7 @@ def costs(groups: Sequence[Group]) -> dict[str, tuple[float, float]]:
 
 
 def regrets(groups: Sequence[Group], loss: str) -> list[tuple[float, float, str, Group]]:
-    """Errors over those of the best loss, their standard error, that loss; the largest first.
+    """Errors over those of the best loss, their standard error, that loss; the surest first.
 
     In the library's way; of losses that broke no more often, in the scans that both got right.
     """
@@ -155,7 +156,7 @@ def regrets(groups: Sequence[Group], loss: str) -> list[tuple[float, float, str,
         over = [(*r, g.loss) for g in others if g is not own and (r := ratio(own, g))]
         if over:
             found.append((*max(over), own))
-    return sorted(found, key=lambda one: -one[0])
+    return sorted(found, key=lambda one: STANDARD_ERRORS * one[1] - one[0])
 
 
 def breaks_from(groups: Sequence[Group], loss: str, way: str) -> tuple[float | None, float] | None:
@@ -183,9 +184,9 @@ def _costs_kept(groups: Sequence[Group]) -> bool | None:
     )
 
 
-def _promised(groups: Sequence[Group]) -> list[Group]:
-    """The default in the library's way, with few enough outliers, and enough scans."""
-    own = [g for g in groups if g.loss == DEFAULT and g.of("way") == "library"]
+def _promised(groups: Sequence[Group], loss: str = DEFAULT) -> list[Group]:
+    """A loss in the library's way, with few enough outliers, and enough scans."""
+    own = [g for g in groups if g.loss == loss and g.of("way") == "library"]
     return [g for g in own if g.of("outlier_share") <= MOST_OUTLIERS and g.scans >= FEWEST]
 
 
@@ -235,8 +236,8 @@ def _of_regret(groups: Sequence[Group]) -> str:
         return ""
     times, error, best, worst = over[0]
     return (
-        f"errors at most {times:.2f} ± {error:.2f} times those of the best loss ({best}, "
-        f"{in_words(worst)})"
+        f"errors {times:.2f} ± {error:.2f} times those of the best loss where that is surest "
+        f"({best}, {in_words(worst)})"
     )
 
 
@@ -262,6 +263,32 @@ def in_words(group: Group) -> str:
 
 
 # ---- table and figures ---------------------------------------------------------------------
+
+
+def _choice(groups: Sequence[Group]) -> AnswerTable:
+    """A row a loss, to choose by."""
+    columns = (
+        "loss", "cost without outliers, %", "±", "worst times the best", "NEES, least",
+        "NEES, most", "sigma / true, least", "sigma / true, most", "broken", "of",
+        "breaks from, library", "breaks from, alone",
+    )  # fmt: skip
+    rows = []
+    for loss in dict.fromkeys(g.loss for g in groups):
+        own, cost = _promised(groups, loss), costs(groups).get(loss, (None, None))
+        over = [r[0] for r in regrets(groups, loss) if r[3].of("outlier_share") <= MOST_OUTLIERS]
+        nees = [g.nees[0] for g in own if g.nees is not None]
+        sigma = [g.sigma_ratio for g in own if g.sigma_ratio is not None]
+        broke = [breaks_from(groups, loss, way) for way in ("library", "alone")]
+        rows.append(
+            (
+                loss, *(None if part is None else 100 * part for part in cost),
+                max(over, default=None), min(nees, default=None), max(nees, default=None),
+                min(sigma, default=None), max(sigma, default=None), sum(g.broken for g in own),
+                sum(g.scans for g in own), *(one and one[0] for one in broke),
+            )
+        )  # fmt: skip
+    title = f"Which loss: the library's way up to {MOST_OUTLIERS:.0%} outliers, every noise"
+    return AnswerTable("choice", title, columns, tuple(rows))
 
 
 def _table(groups: Sequence[Group]) -> AnswerTable:

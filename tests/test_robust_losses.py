@@ -144,7 +144,10 @@ def test_what_is_expected_holds() -> None:
     assert "cauchy +2.6 ± 0.0 %, adaptive +0.0 ± 0.0 %" in found.verdict
     assert "NEES 1.00 to 1.00, 0 of 16 scans broken" in found.verdict
     assert "alone: none 10%, huber/cauchy/adaptive nowhere to 30%" in found.verdict
-    assert len(found.tables[0].rows) == 24 and len(found.figures) == 6
+    assert len(found.tables[1].rows) == 24 and len(found.figures) == 6
+    choice = {row[0]: row for row in found.tables[0].rows}
+    assert choice["none"][-2:] == (None, 0.1) and choice["cauchy"][1] == pytest.approx(2.6)
+    assert choice["cauchy"][3] == pytest.approx(1.026) and choice["none"][3] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
