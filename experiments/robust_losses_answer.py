@@ -257,8 +257,9 @@ def _of_breaking(groups: Sequence[Group]) -> str:
 
 
 def in_words(group: Group) -> str:
-    """A condition by what is not usual about it."""
-    odd = [f"{side} {group.of(side)}" for side, value in SIDES.items() if group.of(side) != value]
+    """A condition by what is not usual about it, the way aside."""
+    sides = {side: value for side, value in SIDES.items() if side != "way"}
+    odd = [f"{side} {group.of(side)}" for side, value in sides.items() if group.of(side) != value]
     return ", ".join(odd).replace("_", " ") or "no outliers"
 
 
@@ -293,20 +294,27 @@ def _choice(groups: Sequence[Group]) -> AnswerTable:
 
 def _table(groups: Sequence[Group]) -> AnswerTable:
     columns = (
-        *SIDES, "loss", "scans", "broken", "refused", "error / bound", "±", "NEES", "± ",
-        "95 % intervals, %", "sigma / true", "iterations", "not converged",
+        "way", "condition", "loss", "scans", "broken", "refused", "error / bound", "±", "NEES",
+        "± ", "95 % intervals, %", "sigma / true", "iterations", "not converged",
     )  # fmt: skip
     ordered = sorted(groups, key=lambda g: [str(part) for part in g.condition])
     rows = tuple(
         (
-            *g.condition, g.loss, g.scans, g.broken, g.refused, *(g.off or (None, None)),
-            *(g.nees or (None, None)), None if g.covered is None else 100 * g.covered,
-            g.sigma_ratio, g.iterations, g.unconverged,
+            g.of("way"), in_words(g), g.loss, g.scans, g.broken, g.refused, *_told(g.off),
+            *_told(g.nees), None if g.covered is None else 100 * g.covered, g.sigma_ratio,
+            g.iterations, g.unconverged,
         )
         for g in ordered
     )  # fmt: skip
     title = "Every condition and loss; errors and NEES are of scans that did not break"
     return AnswerTable("losses", title, columns, rows)
+
+
+def _told(value: tuple[float, float] | None) -> tuple[float | None, float | None]:
+    """A mean and its standard error, where there is one."""
+    if value is None:
+        return None, None
+    return value[0], value[1] if np.isfinite(value[1]) else None
 
 
 def _figures(groups: Sequence[Group]) -> Iterator[AnswerFigure]:
