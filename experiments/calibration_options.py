@@ -6,12 +6,13 @@ Left out, it is what the scan's rig.yaml says, or the default: as on the command
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_type_hints
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -42,7 +43,10 @@ SIMULATED: dict[str, type[SimulateOptions] | type[TrackOptions]] = {
     "images": SimulateOptions,
     "tracks": TrackOptions,
 }
+# Absolute, for a cluster's workers run in folders of their own.
+Place = Annotated[Path, AfterValidator(lambda path: path.expanduser().absolute())]
 SIMULATE, CHANGED = "simulate.", "changed."
+LIKE = SIMULATE + "like"
 SEED = "seed"  # of everything random: the trial's, added to what rig.yaml and simulate.seed say
 
 
@@ -74,17 +78,17 @@ class CalibrationOptions(TrialOptions):
     """How tables call it: the rig's name in a fleet. Default: the scan's folder."""
     command: Command = "calibrate"
     """What is done: that command of sfm-calib."""
-    scan: Path | None = None
+    scan: Place | None = None
     """The scan; for `target` the images of the board."""
     stretch: Annotated[int, Field(ge=MIN_IMAGES)] | None = None
     """Only so many consecutive frames of the scan, from a place that the seed draws."""
-    old: Path | None = None
+    old: Place | None = None
     """The calibration to test, for `recalibrate`; of a simulated rig by default its truth."""
-    board: Path | None = None
+    board: Place | None = None
     """The board's YAML, for `target`, and for `calibrate` with a board."""
-    board_images: Path | None = None
+    board_images: Place | None = None
     """Images of the board by the scan's cameras."""
-    truth: Path | None = None
+    truth: Place | None = None
     """A truth, or another calibration of the same rig in any format, to compare with."""
     simulate: Literal["images", "tracks"] | None = None
     """In place of a scan: rendered images, or feature tracks, which take no mapping; as the options
@@ -182,7 +186,7 @@ def _strangers(options: CalibrationOptions) -> Iterator[str]:
             yield f"{key} is for {' and '.join(owners)}, and the command is {options.command}"
 
 
-def optional(model: type, prefix: str = "") -> Mapping[str, Any]:
+def optional(model: type, prefix: str = "") -> dict[str, Any]:
     """A class's options as fields that may be left out; ranges stay where they are."""
     hints = get_type_hints(model, include_extras=True)
     return {f"{prefix}{name}": (hints[name] | None, None) for name in names_of(model)}
@@ -195,6 +199,7 @@ def _fields() -> dict[str, Any]:
     del found[SEED]
     for model in SIMULATED.values():
         found |= optional(model, SIMULATE)
+    found[LIKE] = (Place | None, None)
     return found | optional(Changed, CHANGED)
 
 

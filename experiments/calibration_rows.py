@@ -1,7 +1,8 @@
-"""A finished calibration as one row: verdict, parameters with sigmas, and how it lies to a truth."""
+"""A finished calibration as a row: verdict, parameters with sigmas, and errors by a truth."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +11,7 @@ from experiments.runner.protocol import TIMING, Cell, Row
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.compare import CompareOptions, compare
-from sfm_calib.drift_record import DriftRecord
+from sfm_calib.drift_record import DriftRecord, DriftTest
 from sfm_calib.drift_verdict import change_text
 from sfm_calib.formats import CameraRig
 from sfm_calib.report.rows import AXES, baseline_sigma
@@ -38,7 +39,7 @@ def _verdict(calibration: Calibration) -> Iterator[tuple[str, Cell]]:
     verdict = calibration.verdict
     assert verdict is not None
     yield "usable", verdict.usable
-    yield "weak", "; ".join(one.what for one in verdict.weak)
+    yield "weak", "; ".join(dict.fromkeys(one.kind or one.what for one in verdict.weak))
     yield "n_weak", len(verdict.weak)
     yield "halves_p", verdict.split.p_value if verdict.split else None
 
@@ -56,7 +57,7 @@ def _solve(calibration: Calibration) -> Iterator[tuple[str, Cell]]:
     yield "n_observations", solve.n_observations
     yield "metric", calibration.rig.metric
     for stage, seconds in solve.seconds.items():
-        yield f"{TIMING}_{stage.replace(' ', '_')}", seconds
+        yield "_".join((TIMING, *re.findall("[a-z]+", stage))), seconds
 
 
 def _drift(calibration: Calibration) -> Iterator[tuple[str, Cell]]:
@@ -67,8 +68,8 @@ def _drift(calibration: Calibration) -> Iterator[tuple[str, Cell]]:
     yield "drift", record.verdict
     yield "drifted", ", or ".join(" and ".join(one) for one in _cameras(record))
     yield "p", min((test.p_corrected for test in record.tests), default=None)
-    yield "change", worst and change_text(worst)
-    yield "change_px", worst and worst.effect_px
+    yield "change", None if worst is None else change_text(worst)
+    yield "change_px", None if worst is None else worst.effect_px
     yield "detectable_px", record.detectable_px
     yield "said", record.lines[0]
 
@@ -78,7 +79,7 @@ def _cameras(record: DriftRecord) -> tuple[tuple[str, ...], ...]:
     return record.moved or ((record.drifted,) if record.drifted else ())
 
 
-def _largest(record: DriftRecord):  # type: ignore[no-untyped-def]
+def _largest(record: DriftRecord) -> DriftTest | None:
     """The test of the largest change among those that found drift, else among all."""
     found = [test for test in record.tests if test.found] or list(record.tests)
     return max(found, key=lambda test: test.effect_px, default=None)

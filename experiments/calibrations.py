@@ -1,4 +1,4 @@
-"""What do calibrations of these scans give: does each rig keep its calibration, what moves a result?
+"""Does each rig keep its calibration, and what do options make of the calibration of a scan?
 
 Method: a trial is one run of `sfm-calib calibrate`, `recalibrate` or `target`, on a scan or on a
 simulated one, with any of the command's options, which may all be swept. It leaves what the command
@@ -18,6 +18,7 @@ from typing import Any
 
 from experiments.calibration_answer import answer
 from experiments.calibration_options import (
+    LIKE,
     SEED,
     TAKEN,
     CalibrationOptions,
@@ -60,7 +61,8 @@ def trial(options: CalibrationOptions, seed: int, folder: Path) -> Row:
     with output_folder(folder):
         cache = Cache(folder.parent / CACHE, shared=True)
         source = source_of(options, seed, folder, cache)
-        outcome = dated(outcome_of(options, source, seed, cache, line_of(options, source, seed, folder)))
+        line = line_of(options, source, seed, folder)
+        outcome = dated(outcome_of(options, source, seed, cache, line))
         if options.report:
             write_results(outcome, folder, ())
         else:
@@ -149,14 +151,9 @@ def _inputs(options: CalibrationOptions) -> Iterator[Path]:
             yield rig_file(options.scan)
     if options.old:  # a folder of results holds a report and a cache as well
         yield from calibration_files(options.old)
-    for path in (options.board, options.board_images, options.truth, _like(options)):
+    for path in (options.board, options.board_images, options.truth, options.said.get(LIKE)):
         if path:
             yield path
-
-
-def _like(options: CalibrationOptions) -> Path | None:
-    path: Path | None = options.said.get("simulate.like")
-    return path
 
 
 STUDY: Study[CalibrationOptions] = Study(CalibrationTrial, trial, answer, inputs, folder=True)
