@@ -46,7 +46,8 @@ class RunCommand:
     jobs: Annotated[int | None, tyro.conf.arg(aliases=("-j",), metavar="N")] = None
     """Trials at a time on this machine; default: as many as it has cores for."""
     cluster: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
-    """Run on the Dask cluster whose scheduler is there, such as tcp://10.0.0.1:8786."""
+    """Run on the Dask cluster whose scheduler is there, such as tcp://10.0.0.1:8786, or which its
+    scheduler file describes."""
     dry_run: bool = False
     """Print the trials and the time they will take, and run none."""
     retry: bool = False
