@@ -74,7 +74,7 @@ class Calibrated:
     def parameters(self) -> tuple[str, ...]:
         """Columns that have a sigma beside them, one that is not zero."""
         row = self.trial.row
-        return tuple(name for name in row if self.number(name + SIGMA))
+        return tuple(n for n in row if self.number(n) is not None and self.number(n + SIGMA))
 
 
 def answer(trials: Sequence[Finished[CalibrationOptions]]) -> Answer:
