@@ -21,7 +21,7 @@ from sfm_calib.report.digits import short
 VERDICTS = ("keep", "replace", "inconclusive", "usable", "not usable", "failed")
 TO_NAME = ("replace", "not usable", "failed")  # in the one line, with the reason
 MOST_NAMED = 3  # of each
-MOST_LETTERS = 100  # of a reason
+MOST_LETTERS = 80  # of a reason
 STANDARD_ERRORS = 3.0
 # What is drawn against swept options: lens parameters of every camera, then places in the rig.
 DRAWN: Mapping[str, tuple[str, ...]] = {
@@ -128,7 +128,8 @@ def _plain(value: object) -> object:
 def _names(options: Sequence[CalibrationOptions]) -> list[str]:
     """What each is called: by its name, or else by what tells its scan from others."""
     scans = {one.scan for one in options if one.scan}
-    common = os.path.commonpath([os.fspath(scan.parent) for scan in scans]) if scans else ""
+    folders = [scan.parent if len(scans) > 1 else scan.parent.parent for scan in scans]
+    common = os.path.commonpath(folders) if folders else ""
     return [
         one.name or (os.path.relpath(one.scan, common) if one.scan else f"simulated {one.simulate}")
         for one in options
@@ -176,9 +177,12 @@ def moved_most(every: Sequence[Calibrated], swept: Sequence[str]) -> Iterator[st
 def _by_value(
     every: Sequence[Calibrated], key: str
 ) -> dict[tuple[str, str], dict[object, list[tuple[float, float]]]]:
-    """Values and sigmas of every parameter of every rig, by what an option was."""
+    """Values and sigmas of every parameter of every rig, by what an option was; of usable results
+    alone, for others may be anywhere."""
     found: dict[tuple[str, str], dict[object, list[tuple[float, float]]]] = {}
     for one in every:
+        if not one.trial.row.get("usable"):
+            continue
         for name in one.parameters:
             value, sigma = one.number(name), one.number(name + SIGMA)
             settings = dict(one.settings)
@@ -203,16 +207,13 @@ def against_truth(every: Sequence[Calibrated]) -> tuple[list[str], bool | None]:
             shares.setdefault(data, []).append((z**2 * directions, directions))
     if not shares:
         return [], None
-    chi2, directions = np.array([np.mean(some, axis=0) for some in shares.values()]).T
-    mean = float(chi2.sum() / directions.sum())
-    error = math.sqrt(2 / directions.sum())
-    if len(chi2) > 1:  # the scatter between scans tells of errors that their sigmas do not know
-        apart = chi2 - mean * directions
-        error = max(error, float(apart.std(ddof=1)) * math.sqrt(len(chi2)) / directions.sum())
-    z, bar = math.sqrt(mean), error / (2 * math.sqrt(max(mean, error)))
+    chi2, directions = np.sum([np.mean(some, axis=0) for some in shares.values()], axis=0).tolist()
+    by_chance = math.sqrt(2 / directions)  # of the mean square, where the sigmas are true
+    z = math.sqrt(chi2 / directions)
+    bar = z * by_chance / 2
     of = f"{len(shares)} scan{'s' * (len(shares) != 1)}"
-    said = f"errors are {z:.2f} ± {bar:.2f} of what the sigmas say ({of} with a truth)"
-    return [said], mean <= 1 + STANDARD_ERRORS * error
+    said = f"errors are {z:.2f} ± {bar:.2f} times what the sigmas say ({of} with a truth)"
+    return [said], z**2 <= 1 + STANDARD_ERRORS * by_chance
 
 
 # ---- tables --------------------------------------------------------------------------------
@@ -275,14 +276,14 @@ def drift_figure(every: Sequence[Calibrated]) -> Iterator[AnswerFigure]:
     if not some:
         return
     x = [one.name for one in some]
-    series = [
-        Series("largest change", x, [one.number("change_px") or 0.0 for one in some]),
-        Series(
-            "found wherever it is", x, [one.number("detectable_px") or 0.0 for one in some],
-            dashed=True,
-        ),
-    ]  # fmt: skip
-    figure = lines(series, "", "px, rms over an image")
+    change, found = (
+        [one.number(column) or math.nan for one in some]
+        for column in ("change_px", "detectable_px")
+    )
+    series = [Series("largest change", x, change), Series("found wherever it is", x, found)]
+    figure = lines(series, "", "px, rms over an image", log_y=True)
+    figure.update_traces(mode="markers")
+    figure.update_traces(selector=1, marker={"symbol": "line-ew-open", "size": 18})
     yield AnswerFigure(
         "drift", "Change of each rig",
         "Where nothing was found, the largest change is what noise makes of an untouched rig.",
@@ -307,7 +308,7 @@ def sweep_figures(every: Sequence[Calibrated], swept: Sequence[str]) -> Iterator
                 file = f"{key}_{title}".replace(" ", "_").replace(".", "_")
                 yield AnswerFigure(
                     file, f"{title.capitalize()} against {key}",
-                    f"Each parameter less its mean over {key}; bars: the stated sigma.",
+                    f"Usable results, each parameter less its mean over {key}; bars: the stated sigma.",
                     lines(series, key, f"change, {unit}"),
                 )  # fmt: skip
 

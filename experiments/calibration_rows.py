@@ -80,9 +80,13 @@ def _cameras(record: DriftRecord) -> tuple[tuple[str, ...], ...]:
 
 
 def _largest(record: DriftRecord) -> DriftTest | None:
-    """The test of the largest change among those that found drift, else among all."""
+    """The test of the largest change among those that found drift, else among all.
+
+    All of a lens, and the rig as a whole, say again what a group says.
+    """
     found = [test for test in record.tests if test.found] or list(record.tests)
-    return max(found, key=lambda test: test.effect_px, default=None)
+    parts = [test for test in found if test.group not in ("lens", "places")] or found
+    return max(parts, key=lambda test: test.effect_px, default=None)
 
 
 def _lenses(calibration: Calibration) -> Iterator[tuple[str, Cell]]:

@@ -3,10 +3,10 @@
 Method: a trial is one run of `sfm-calib calibrate`, `recalibrate` or `target`, on a scan or on a
 simulated one, with any of the command's options, which may all be swept. It leaves what the command
 leaves in OUT/trials/KEY; features, matches and models are made once for all trials that share them.
+configs/fleet.yaml is for rigs of yours; the fleet below is simulated.
 Expectation: none; with a truth, errors no larger than the stated sigmas let expect.
 Source: none.
-Run: sfm-calib run configs/fleet.yaml -o out/fleet (yours to fill in),
-sfm-calib run configs/studies/simulated_fleet.yaml -o out/simulated_fleet
+Run: sfm-calib run configs/studies/simulated_fleet.yaml -o out/simulated_fleet
 """
 
 from __future__ import annotations

@@ -72,20 +72,30 @@ def test_a_sweep_is_told_option_by_option() -> None:
     trials += [swept("cauchy", seed, 502.0 + seed) for seed in (0, 1)]
     found = answer(trials)
     assert found.verdict == (
-        "4 trials: 4 usable; loss moves cam0.fx of one most, by 2.0 (4.0 sigma)"
+        "4 trials: 4 usable; loss moves cam0.fx of s/one most, by 2.0 (4.0 sigma)"
     )
     rigs, parameters = found.tables
     assert rigs.columns[:4] == ("rig", "loss", "seed", "verdict")
     assert parameters.columns == ("rig", "loss", "parameter", "trials", "mean", "scatter", "sigma")
     # k1 is held: it has no sigma, and nothing to tell
     assert parameters.rows == (
-        ("one", "huber", "cam0.fx", 2, 500.5, pytest.approx(0.5**0.5), 0.5),
-        ("one", "cauchy", "cam0.fx", 2, 502.5, pytest.approx(0.5**0.5), 0.5),
+        ("s/one", "huber", "cam0.fx", 2, 500.5, pytest.approx(0.5**0.5), 0.5),
+        ("s/one", "cauchy", "cam0.fx", 2, 502.5, pytest.approx(0.5**0.5), 0.5),
     )
     (figure,) = found.figures
     (line,) = figure.figure.data
     assert list(line.x) == ["huber", "cauchy"]
     assert list(line.y) == [-1.0, 1.0] and list(line.error_y["array"]) == [0.5, 0.5]
+
+
+def test_results_that_are_not_usable_are_counted_and_not_drawn() -> None:
+    trials = [swept("huber", 0, 500.0), swept("cauchy", 0, 501.0)]
+    found = answer([*trials, swept("none", 0, 22.0, usable=False, weak="doming")])
+    assert found.verdict == (
+        "3 trials: 2 usable, 1 not usable (s/one (loss none): doming); "
+        "loss moves cam0.fx of s/one most, by 1.0 (2.0 sigma)"
+    )
+    assert list(found.figures[0].figure.data[0].x) == ["huber", "cauchy"]
 
 
 def test_scans_without_a_name_are_called_by_what_tells_them_apart() -> None:
@@ -113,7 +123,8 @@ def test_with_a_truth_the_sigmas_are_put_to_the_test() -> None:
     assert (right.holds, small.holds, wide.holds) == (True, False, True)
     for found, z in ((right, 1.0), (small, 1.5), (wide, 0.6)):
         said = re.search(
-            r"errors are ([0-9.]+) ± ([0-9.]+) of what .* \(20 scans with a truth\)", found.verdict
+            r"errors are ([0-9.]+) ± ([0-9.]+) times what .* \(20 scans with a truth\)",
+            found.verdict,
         )
         assert said and abs(float(said[1]) - z) < 3 * float(said[2]) < 0.3
 

@@ -7,6 +7,8 @@ import pickle
 import re
 import shlex
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from synthetic.scans import blank
 from experiments.calibration_options import CHANGED, CalibrationOptions, CalibrationTrial, Changed
 from experiments.calibration_rows import row_of, truth_columns
 from experiments.calibration_sources import source_of, stretch_of, touched
-from experiments.calibrations import STUDY, line_of, trial
+from experiments.calibrations import CACHE, STUDY, line_of, trial
 from experiments.runner.protocol import Cell
 from experiments.runner.sweep import load_study, trials_of
 from graphs.frames import log_rotation
@@ -244,6 +246,24 @@ def test_a_refused_trial_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="1 readable image, and a calibration needs"):
         trial(options(scan=tmp_path / "scan"), 0, tmp_path / "trials" / "one")
     assert not (tmp_path / "trials" / "one").exists()
+
+
+@pytest.mark.slow
+def test_trials_at_once_on_one_rendered_scan_map_it_once(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", reason="the simulator needs open3d (the extra `depth`)")
+    rendered = {"simulate.rig": "stereo", "simulate.frames": 8, "simulate.size": [320, 240]}
+    rendered |= {"simulate.supersampling": 1, "max_features": 250, "lens": "radial"}
+    asked = [options(simulate="images", loss=loss, **rendered) for loss in ("huber", "cauchy")]
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        runs = [pool.submit(trial, o, 0, tmp_path / f"{i}") for i, o in enumerate(asked)]
+        rows = [run.result() for run in runs]
+    assert rows[0]["n_images"] == rows[1]["n_images"] == 16
+    assert rows[0]["cam0.fx"] != rows[1]["cam0.fx"]
+    made = [path.name.partition(".")[0] for path in (tmp_path / CACHE).iterdir() if path.is_dir()]
+    assert sorted(made) == ["features", "matches", "models", "simulation"]
+    for i, row in enumerate(rows):
+        assert (tmp_path / f"{i}" / "report.html").exists()
+        assert abs(float(str(row["cam0.fx.z"]))) < 6
 
 
 # ---- configs -------------------------------------------------------------------------------
