@@ -222,19 +222,18 @@ def against_truth(every: Sequence[Calibrated]) -> tuple[list[str], bool | None]:
 def rig_table(every: Sequence[Calibrated], swept: Sequence[str]) -> AnswerTable:
     """A row a trial."""
     measured = {
-        "p": "p", "largest change": "change", "px": "change_px", "found from px": "detectable_px",
+        "drifted": "drifted", "p": "p", "largest change": "change", "px": "change_px", "found from px": "detectable_px",
         "weak": "weak", "rms px": "rms_px", "noise px": "noise_px", "frames": "n_frames",
         "converged": "converged", "error px": "error_px", "z rms": "z_rms",
     }  # fmt: skip
     there = {title: column for title, column in measured.items() if _any(every, column)}
-    columns = ("rig", *swept, "verdict", "drifted", *there, "failure")
+    columns = ("rig", *swept, "verdict", *there, "failure")
     rows = []
     for one in every:
         settings, row = dict(one.settings), one.trial.row
         rows.append((
             one.rig, *(_cell(settings.get(key)) for key in swept), one.verdict,
-            _cell(row.get("drifted")), *(_cell(row.get(column)) for column in there.values()),
-            one.trial.error,
+            *(_cell(row.get(column)) for column in there.values()), one.trial.error,
         ))  # fmt: skip
     return AnswerTable("rigs", "Rig by rig", columns, tuple(rows))
 
@@ -297,9 +296,10 @@ def sweep_figures(every: Sequence[Calibrated], swept: Sequence[str]) -> Iterator
         if key == SEED:
             continue
         found = _by_value(every, key)
+        rigs = {rig for rig, _ in found}
         for title, parameters in DRAWN.items():
             series = [
-                _series(f"{name} of {rig}", groups)
+                _series(name if len(rigs) == 1 else f"{name} of {rig}", groups)
                 for (rig, name), groups in found.items()
                 if name.rpartition(".")[2] in parameters and len(groups) > 1
             ]
@@ -308,7 +308,7 @@ def sweep_figures(every: Sequence[Calibrated], swept: Sequence[str]) -> Iterator
                 file = f"{key}_{title}".replace(" ", "_").replace(".", "_")
                 yield AnswerFigure(
                     file, f"{title.capitalize()} against {key}",
-                    f"Usable results, each parameter less its mean over {key}; bars: the stated sigma.",
+                    f"Usable results, each less its mean over {key}; bars: the stated sigma.",
                     lines(series, key, f"change, {unit}"),
                 )  # fmt: skip
 
