@@ -31,6 +31,11 @@ DRAWN: Mapping[str, tuple[str, ...]] = {
     "baseline": ("baseline",),
 }
 UNITS = {"focal length": "px", "principal point": "px", "rotation": "deg", "baseline": "m"}
+COLUMNS = {
+    "drifted": "drifted", "p": "p", "largest change": "change", "px": "change_px",
+    "found from px": "detectable_px", "weak": "weak", "rms px": "rms_px", "noise px": "noise_px",
+    "frames": "n_frames", "converged": "converged", "error px": "error_px", "z rms": "z_rms",
+}  # fmt: skip
 OF_RIG = ("name", "scan", "old", "board", "board_images", "truth", "report")  # and not how
 
 
@@ -221,12 +226,7 @@ def against_truth(every: Sequence[Calibrated]) -> tuple[list[str], bool | None]:
 
 def rig_table(every: Sequence[Calibrated], swept: Sequence[str]) -> AnswerTable:
     """A row a trial."""
-    measured = {
-        "drifted": "drifted", "p": "p", "largest change": "change", "px": "change_px", "found from px": "detectable_px",
-        "weak": "weak", "rms px": "rms_px", "noise px": "noise_px", "frames": "n_frames",
-        "converged": "converged", "error px": "error_px", "z rms": "z_rms",
-    }  # fmt: skip
-    there = {title: column for title, column in measured.items() if _any(every, column)}
+    there = {title: column for title, column in COLUMNS.items() if _any(every, column)}
     columns = ("rig", *swept, "verdict", *there, "failure")
     rows = []
     for one in every:
