@@ -28,7 +28,7 @@ test: $(STAMP) ## the tests that take seconds
 
 test-all: $(STAMP) ## all tests, the slow ones included
 	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; the tests that need Open3D are skipped"
-	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m ""
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "" --hypothesis-profile default
 
 check: $(STAMP) ## formatting, lint and types
 	@status=0; for tool in "ruff format --check ." "ruff check ." mypy; do \

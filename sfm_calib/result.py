@@ -60,12 +60,11 @@ class CamFromRig(Record):
     def of(cls, name: str, place: Transform, sigma: Mapping[str, float]) -> CamFromRig:
         """Of the camera of that name; `sigma` by parameter, 0 where it says none."""
         told = [sigma.get(parameter, 0.0) for parameter in pose_names(name)]
-        turn, move = np.degrees(told[:3]).tolist(), told[3:]
         return cls(
             rotation_wxyz=tuple(place.rotation_wxyz.tolist()),
             translation=tuple(place.translation.tolist()),
-            sigma_rotation_deg=tuple(turn),
-            sigma_translation=tuple(move),
+            sigma_rotation_deg=tuple(np.degrees(told[:3]).tolist()),
+            sigma_translation=tuple(told[3:]),
         )
 
 
@@ -368,14 +367,12 @@ class Calibration(Record):
 
 def truth(cameras: list[Camera], cam_from_rig: list[Transform], version: str) -> Calibration:
     """A calibration known exactly, as a simulation writes it: metric, without sigmas."""
+    placed = zip(cameras, cam_from_rig, strict=True)
     return Calibration(
         cameras={c.name: CameraResult(lens=c.lens, size=c.size, params=c.named()) for c in cameras},
         rig=RigResult(
             reference=cameras[0].name,
-            cam_from_rig={
-                c.name: CamFromRig.of(c.name, t, {})
-                for c, t in zip(cameras, cam_from_rig, strict=True)
-            },
+            cam_from_rig={c.name: CamFromRig.of(c.name, t, {}) for c, t in placed},
             metric=True,
             scale=Scale(source="simulation", sigma_relative=0.0),
         ),
@@ -385,8 +382,7 @@ def truth(cameras: list[Camera], cam_from_rig: list[Transform], version: str) ->
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
     """Write atomically. Raises CalibrationError when the place cannot be written."""
-    content = calibration.model_dump_json(indent=1)
-    write_atomically(path, content + "\n")
+    write_atomically(path, calibration.model_dump_json(indent=1) + "\n")
 
 
 def load_calibration(path: Path) -> Calibration:

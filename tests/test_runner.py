@@ -329,7 +329,7 @@ def test_a_dry_run_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["run", str(path), "-o", str(out), "--dry-run", "-j", "4"]) == 0
     said = capsys.readouterr().out
     assert "8 trials; about 2 min on this machine, 4 at a time" in said
-    assert "draws=5 seed=3" in said
+    assert "draws=5, seed=3" in said
     assert not out.exists()
 
 

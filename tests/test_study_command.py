@@ -82,7 +82,12 @@ def test_a_whole_study_is_answered(tmp_path: Path) -> None:
         "asked": 12, "finished": 12, "failed": 0, "broken": 0, "elsewhere": 0,
     }  # fmt: skip
     assert record.warnings == () and record.failures == () and record.tables == ("ratios.csv",)
-    assert record.config == {"study": "example", "grid": {"draws": [2, 10]}, "seeds": 6}
+    assert record.config == {
+        "study": "example",
+        "grid": {"draws": [2, 10]},
+        "seeds": 6,
+        "seconds": 0.001,
+    }
     origin = record.origin
     assert origin.seconds == pytest.approx(6.0) and origin.git == {"abc123": 12}
     assert origin.first == BEGAN and origin.last == BEGAN + timedelta(seconds=11)

@@ -25,7 +25,7 @@ from experiments.runner.rows import (
     StoredRow,
     read_results,
 )
-from experiments.runner.sweep import StudyConfig, Trial
+from experiments.runner.sweep import Trial, in_words
 from sfm_calib.errors import CalibrationError
 from sfm_calib.record import Record
 
@@ -175,20 +175,13 @@ def _failures(results: Results) -> tuple[Failure, ...]:
         Failure(
             error=rows[0][1].error or "",
             count=len(rows),
-            first=swept_text(results.config, rows[0][0]),
+            first=in_words(rows[0][0], results.config),
             ending=rows[0][1].ending,
             traceback=rows[0][1].traceback,
         )
         for rows in ways.values()
     ]
     return tuple(sorted(found, key=lambda failure: -failure.count))
-
-
-def swept_text(config: StudyConfig, trial: Trial) -> str:
-    """What tells a trial from the others of its study."""
-    options = trial.options.model_dump(mode="json")
-    swept = dict.fromkeys([*config.grid, *(key for one in config.list for key in one)])
-    return ", ".join([*(f"{key}={options[key]}" for key in swept), f"seed={trial.seed}"])
 
 
 # ---- where rows come from ------------------------------------------------------------------
