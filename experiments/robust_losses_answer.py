@@ -220,14 +220,24 @@ def _of_costs(groups: Sequence[Group]) -> str:
 
 
 def _of_default(groups: Sequence[Group]) -> str:
-    means = [g.nees[0] for g in _promised(groups) if g.nees is not None]
+    some = _promised(groups)
+    means = [g.nees[0] for g in some if g.nees is not None]
     if not means:
         return ""
-    broken = sum(g.broken for g in _promised(groups))
+    worst = {loss: _worst(groups, loss) for loss in dict.fromkeys(g.loss for g in groups)}
+    each = ", ".join(f"{loss} {times:.2f}" for loss, times in worst.items() if times is not None)
+    beside = f", errors at worst so many times the best loss's: {each}" if each else ""
     return (
-        f"{DEFAULT} in the library's way, to {MOST_OUTLIERS:.0%} outliers: NEES {min(means):.2f} "
-        f"to {max(means):.2f}, {broken} of {sum(g.scans for g in _promised(groups))} scans broken"
+        f"in the library's way, to {MOST_OUTLIERS:.0%} outliers, {DEFAULT} has NEES "
+        f"{min(means):.2f} to {max(means):.2f}, {sum(g.broken for g in some)} of "
+        f"{sum(g.scans for g in some)} scans broken{beside}"
     )
+
+
+def _worst(groups: Sequence[Group], loss: str) -> float | None:
+    """Errors over those of the best loss where outliers are few enough, at worst."""
+    over = [r[0] for r in regrets(groups, loss) if r[3].of("outlier_share") <= MOST_OUTLIERS]
+    return max(over, default=None)
 
 
 def _of_regret(groups: Sequence[Group]) -> str:
@@ -236,8 +246,8 @@ def _of_regret(groups: Sequence[Group]) -> str:
         return ""
     times, error, best, worst = over[0]
     return (
-        f"errors {times:.2f} ± {error:.2f} times those of the best loss where that is surest "
-        f"({best}, {in_words(worst)})"
+        f"surest, {DEFAULT}'s are {times:.2f} ± {error:.2f} times those of {best} "
+        f"({in_words(worst)})"
     )
 
 
@@ -276,14 +286,13 @@ def _choice(groups: Sequence[Group]) -> AnswerTable:
     rows = []
     for loss in dict.fromkeys(g.loss for g in groups):
         own, cost = _promised(groups, loss), costs(groups).get(loss, (None, None))
-        over = [r[0] for r in regrets(groups, loss) if r[3].of("outlier_share") <= MOST_OUTLIERS]
         nees = [g.nees[0] for g in own if g.nees is not None]
         sigma = [g.sigma_ratio for g in own if g.sigma_ratio is not None]
         broke = [breaks_from(groups, loss, way) for way in ("library", "alone")]
         rows.append(
             (
                 loss, *(None if part is None else 100 * part for part in cost),
-                max(over, default=None), min(nees, default=None), max(nees, default=None),
+                _worst(groups, loss), min(nees, default=None), max(nees, default=None),
                 min(sigma, default=None), max(sigma, default=None), sum(g.broken for g in own),
                 sum(g.scans for g in own), *(one and one[0] for one in broke),
             )

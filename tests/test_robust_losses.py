@@ -142,7 +142,8 @@ def test_what_is_expected_holds() -> None:
     found = answer(rows())
     assert found.holds and found.verdict.startswith("yes: without outliers")
     assert "cauchy +2.6 ± 0.0 %, adaptive +0.0 ± 0.0 %" in found.verdict
-    assert "NEES 1.00 to 1.00, 0 of 16 scans broken" in found.verdict
+    assert "cauchy has NEES 1.00 to 1.00, 0 of 16 scans broken, errors" in found.verdict
+    assert "none 1.00, huber 1.03, cauchy 1.03, adaptive 1.00" in found.verdict
     assert "alone: none 10%, huber/cauchy/adaptive nowhere to 30%" in found.verdict
     assert len(found.tables[1].rows) == 24 and len(found.figures) == 6
     choice = {row[0]: row for row in found.tables[0].rows}
