@@ -6,7 +6,7 @@ leaves in OUT/trials/KEY; features, matches and models are made once for all tri
 configs/fleet.yaml is for rigs of yours; the fleet below is simulated.
 Expectation: none; with a truth, errors no larger than the stated sigmas let expect.
 Source: none.
-Run: sfm-calib run configs/studies/simulated_fleet.yaml -o out/simulated_fleet
+Run: sfm-calib run configs/studies/calibrations.yaml -o out/calibrations
 """
 
 from __future__ import annotations

@@ -297,8 +297,8 @@ def test_the_fleet_example_is_a_fleet_once_its_paths_are_there(
     assert now[0].key != trials[0].key and [t.key for t in now[1:]] == [t.key for t in trials[1:]]
 
 
-def test_the_simulated_fleet_needs_no_files() -> None:
-    trials = trials_of(load_study(ROOT / "configs/studies/simulated_fleet.yaml"))
+def test_the_fleet_to_try_needs_no_files() -> None:
+    trials = trials_of(load_study(ROOT / "configs/studies/calibrations.yaml"))
     changed = [t for t in trials if any(key.startswith(CHANGED) for key in t.options.said)]
     assert 0 < len(changed) < len(trials)
     assert all(not STUDY.inputs(t.options) for t in trials)
