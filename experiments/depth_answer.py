@@ -127,8 +127,11 @@ def in_words(groups: Sequence[Group]) -> str:
         said.append(f"Monte Carlo / propagated {low:.3f} to {high:.3f}")
     for g in groups:
         if g.effect == "scan":
-            held = in_digits(g.ratio)
-            said.append(f"{g.trials} calibrated scans: depth errors {held} of the stated sigma")
+            noisy = "" if g.total[0] is None else f", {g.total[0]:.2f} with the noise of pixels"
+            said.append(
+                f"{g.trials} calibrated scans: depth errors {in_digits(g.ratio)} of their stated "
+                f"sigma{noisy}"
+            )
     names = [
         g.effect if g.shape == "straight" else f"{g.effect} ({g.shape})" for g in broken(groups)
     ]

@@ -163,7 +163,7 @@ def test_a_law_that_holds() -> None:
     found = answered()
     assert found.holds is True
     assert found.verdict.startswith("yes: pixels Z^2.00") and "r^3.00" in found.verdict
-    assert "20 calibrated scans: depth errors 0.95 ± 0.03 of the stated sigma" in found.verdict
+    assert "20 calibrated scans: depth errors 0.95 ± 0.03 of their stated" in found.verdict
     assert [table.name for table in found.tables] == ["effects", "rigs"]
     assert [f.name for f in found.figures] == ["depth", "radius", "scan_depth", "scan_z"]
     row = found.tables[0].rows[0]
