@@ -13,6 +13,8 @@ from sfm_calib.record import Record
 
 MOST_STEPS = 200
 SETTLED_M = 1e-6  # a step that moves no point farther
+# Or one that changes the rms by less of it: what slides, as a sphere turns, never rests.
+SETTLED_RMS = 1e-6
 LEAST_MATCHED = 10  # points; six tell a place
 # Stages of `laid_on`: points farther than so many of the limit do not pull. A wide one first finds
 # the place, and what has no counterpart bends the last one least.
@@ -90,12 +92,14 @@ def align_icp(
     """
     transform, settled = start, False
     for limit in (factor * max_correspondence_m for factor in STAGES):
+        before = np.inf
         for _ in range(MOST_STEPS):
-            step, moved_m = _step(transform @ points, surface, limit)
+            step, moved_m, rms = _step(transform @ points, surface, limit)
             transform = step @ transform
-            settled = moved_m < SETTLED_M
+            settled = moved_m < SETTLED_M or abs(before - rms) <= SETTLED_RMS * rms
             if settled:
                 break
+            before = rms
     at = transform @ points
     nearest, normals = surface.closest(at)
     near = np.linalg.norm(at - nearest, axis=1) <= max_correspondence_m
@@ -104,8 +108,8 @@ def align_icp(
     return Alignment(transform, float(near.mean()), rms, settled)
 
 
-def _step(at: FloatArray, surface: Surface, limit_m: float) -> tuple[Transform, float]:
-    """A Gauss-Newton step, and how far it moves a point at most."""
+def _step(at: FloatArray, surface: Surface, limit_m: float) -> tuple[Transform, float, float]:
+    """A Gauss-Newton step, how far it moves a point at most, and the rms before it."""
     nearest, normals = surface.closest(at)
     near = np.linalg.norm(at - nearest, axis=1) <= limit_m
     if near.sum() < LEAST_MATCHED:
@@ -118,8 +122,10 @@ def _step(at: FloatArray, surface: Surface, limit_m: float) -> tuple[Transform, 
     middle = p.mean(axis=0)
     jacobian = np.hstack([np.cross(p - middle, n), n])
     # The least step where the surface lets it slide: a sphere turns, a plane shifts.
-    found = np.linalg.lstsq(jacobian, -((p - q) * n).sum(axis=1), rcond=1e-9)[0]
+    along = ((p - q) * n).sum(axis=1)
+    found = np.linalg.lstsq(jacobian, -along, rcond=1e-9)[0]
     turn = Transform.exp(found[:3], np.zeros(3))
     shift = middle - turn @ middle + found[3:]
     step = Transform(turn.rotation, shift)
-    return step, float(np.linalg.norm(step @ at - at, axis=1).max())
+    moved_m = float(np.linalg.norm(step @ at - at, axis=1).max())
+    return step, moved_m, float(np.sqrt((along**2).mean()))
