@@ -245,7 +245,7 @@ def test_a_shifted_cube(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_millimetres_and_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.savetxt(tmp_path / "a.xyz", 1e3 * (box().sampled(500, 0) + [0, 0, 0.002]))
+    np.savetxt(tmp_path / "a.xyz", 1e3 * (box().sampled(500, 0) + np.array([0, 0, 0.002])))
     in_mm = Surface(1e3 * box().vertices, box().triangles)
     b, out = write(in_mm, tmp_path / "b.ply"), tmp_path / "out"
     assert main(["surface-distance", str(tmp_path / "a.xyz"), str(b), "-o", str(out)]) == 0
@@ -259,7 +259,7 @@ def test_millimetres_and_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_what_only_one_side_has_can_be_left_out(tmp_path: Path) -> None:
     half = sheet().vertices * [0.5, 1, 1]
-    a = write(Surface(half + [0, 0, 0.01], sheet().triangles), tmp_path / "a.ply")
+    a = write(Surface(half + np.array([0, 0, 0.01]), sheet().triangles), tmp_path / "a.ply")
     b, out = write(sheet(), tmp_path / "b.ply"), tmp_path / "out"
     assert main(["surface-distance", str(a), str(b), "-o", str(out), "--crop", "0.0101"]) == 0
     found = record(out)
