@@ -33,6 +33,7 @@ CASES = tuple(
     CoverageOptions(geometry=geometry, noise=noise) for noise in NOISES for geometry in GEOMETRIES
 )
 NAMES = ["cam0.fx", "cam0.fy", "cam1.fx", "cam1.fy"]
+CONFIG = Path(__file__).parents[1] / "configs/studies/coverage.yaml"
 SCANS = 20  # of the requirement
 
 
@@ -181,7 +182,7 @@ def test_of_few_scans_nothing_is_said() -> None:
 
 
 def test_the_config_asks_for_every_case() -> None:
-    trials = trials_of(load_study(Path("configs/studies/coverage.yaml")))
+    trials = trials_of(load_study(CONFIG))
     assert {trial.options for trial in trials} == set(CASES)
     assert len(trials) >= FEWEST_SCANS * len(CASES)
 
