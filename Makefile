@@ -24,11 +24,11 @@ demo: $(STAMP) ## simulate a three-camera scan, calibrate it, compare with the t
 
 test: $(STAMP) ## the tests that take seconds
 	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; the tests that need Open3D are skipped"
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4
 
 test-all: $(STAMP) ## all tests, the slow ones included
 	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; the tests that need Open3D are skipped"
-	@$(BIN)/python -m pytest -q -m ""
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m ""
 
 check: $(STAMP) ## formatting, lint and types
 	@status=0; for tool in "ruff format --check ." "ruff check ." mypy; do \

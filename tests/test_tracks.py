@@ -20,7 +20,8 @@ from graphs.lenses import LENS_NAMES, LensName
 from graphs.losses import INVALID_SIGMAS, LEAST_CURVATURE, LOSS_NAMES, SCALE_95, LossName
 from graphs.problem import Estimate, Observations, Problem, residuals_px
 from graphs.rows import bearing_basis
-from graphs.solve import State, evaluate, linearised, threads
+from graphs.solve import State, evaluate, linearised
+from graphs.threads import threads
 
 SIGMA_PX = 0.5
 POOL = ThreadPoolExecutor(2)
