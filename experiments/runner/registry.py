@@ -16,12 +16,14 @@ STUDIES = (
     "coverage",
     "depth_camera_cabin",
     "depth_error",
+    "drift",
     "example",
     "planar_pose",
     "robust_losses",
     "targetless_vs_target",
     "views_needed",
     "weak_geometry",
+    "wrong_starts",
 )
 
 
