@@ -98,7 +98,8 @@ def nees_figure(summaries: Sequence[Summary]) -> AnswerFigure:
         )
     figure.add_hline(y=1, line={"color": MUTED, "dash": "dot"})
     styled(figure, 400)
-    figure.update_yaxes(title="NEES a degree of freedom")
+    figure.update_xaxes(automargin=True)
+    figure.update_yaxes(title="NEES a degree of freedom", rangemode="normal")
     figure.update_layout(showlegend=True, scattermode="group", scattergap=0.6)
     caption = (
         "Errors are as large as stated at 1, larger above. Bars: a standard error of so many scans "
@@ -113,18 +114,22 @@ def coverage_figure(summaries: Sequence[Summary]) -> AnswerFigure:
     low, high = (100 * share for share in COVERAGE)
     figure.add_hrect(y0=low, y1=high, fillcolor=RULE, opacity=0.5, line_width=0, layer="below")
     figure.add_hline(y=95, line={"color": MUTED, "dash": "dot"})
-    for index, s in enumerate(summaries):
+    geometries = list(dict.fromkeys(s.case.split()[0] for s in summaries))
+    for s in summaries:
+        colour = camera_colour(geometries.index(s.case.split()[0]))
         kinds = [kind for kind in _kinds(summaries) if kind in s.coverage]
         figure.add_scatter(
             x=kinds,
             y=[100 * s.coverage[kind] for kind in kinds],
             name=plain(s.case),
             mode="markers",
-            marker={"color": camera_colour(index), "symbol": _symbol(s), "size": 8},
+            marker={"color": colour, "symbol": _symbol(s), "size": 8},
         )
     styled(figure, 420)
     figure.update_yaxes(title="95 % intervals that hold the truth, %")
-    figure.update_xaxes(categoryarray=list(_kinds(summaries)), categoryorder="array")
+    figure.update_xaxes(
+        categoryarray=list(_kinds(summaries)), categoryorder="array", automargin=True
+    )
     figure.update_layout(showlegend=True)
     caption = (
         "The band is what is promised; of one kind of parameter chance may exceed it by three "
