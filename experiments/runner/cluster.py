@@ -31,18 +31,19 @@ def distributed() -> Any:
 
 
 def run_on_cluster(jobs: Iterable[Job], address: str) -> Iterator[StoredRow]:
-    """Rows as they finish, from the workers of the scheduler at `address`.
+    """Rows as they finish, from the workers of the scheduler at `address`, or of its file.
 
     Raises CalibrationError when there is no scheduler, when it is lost, and when its workers do not
     have this project.
     """
     dask = distributed()
     try:
-        client = dask.Client(address, timeout=CONNECT_S, set_as_default=False)
+        place = "scheduler_file" if address.endswith(".json") else "address"
+        client = dask.Client(**{place: address}, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise CalibrationError(
             f"no Dask scheduler answers at {address} within {CONNECT_S} s: start one with "
-            "`dask scheduler`, and give the address it prints"
+            "`dask scheduler`, and give the address it prints, or its --scheduler-file"
         ) from error
     with closing(client):
         _check_workers(client, address)

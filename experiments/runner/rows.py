@@ -154,7 +154,8 @@ def read_row(path: Path) -> StoredRow:
 
 def error_line(error: BaseException) -> str:
     """The first line of what an error says, or its kind where it says nothing."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return line.encode("utf-8", "replace").decode()  # names of files may hold what Parquet cannot
 
 
 # ---- all rows ------------------------------------------------------------------------------

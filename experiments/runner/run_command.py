@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import Counter
@@ -18,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from experiments.runner.rows import StoredRow, arrow
 from experiments.runner.run import Pace, Plan, plan, run
-from experiments.runner.sweep import StudyConfig, Trial, load_study, trials_of
+from experiments.runner.sweep import in_words, load_study, trials_of
 from sfm_calib.errors import CalibrationError
 from sfm_calib.output import output_folder
 from sfm_calib.terminal import print_line, result_console
@@ -46,7 +45,8 @@ class RunCommand:
     jobs: Annotated[int | None, tyro.conf.arg(aliases=("-j",), metavar="N")] = None
     """Trials at a time on this machine; default: as many as it has cores for."""
     cluster: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
-    """Run on the Dask cluster whose scheduler is there, such as tcp://10.0.0.1:8786."""
+    """Run on the Dask cluster whose scheduler is there, such as tcp://10.0.0.1:8786, or which its
+    scheduler file describes."""
     dry_run: bool = False
     """Print the trials and the time they will take, and run none."""
     retry: bool = False
@@ -76,7 +76,7 @@ class RunCommand:
 def _print_plan(planned: Plan, out: Path, console: Console) -> None:
     todo = planned.todo
     for trial in todo[:MOST_SHOWN]:
-        print_line(console, _described(trial, planned.config))
+        print_line(console, f"{trial.key}  {in_words(trial, planned.config)}")
     if len(todo) > MOST_SHOWN:
         print_line(console, f"... and {len(todo) - MOST_SHOWN} more")
     done = len(planned.trials) - len(todo)
@@ -88,14 +88,6 @@ def _print_plan(planned: Plan, out: Path, console: Console) -> None:
         many = f"{planned.processes} at a time" if planned.processes > 1 else "one at a time"
         took = f"about {duration(seconds)} on this machine, {many}"
     print_line(console, f"{len(planned.trials)} trials{finished}; {took}")
-
-
-def _described(trial: Trial, config: StudyConfig) -> str:
-    """What sets a trial apart from the others."""
-    own = trial.options.model_dump(mode="json")
-    swept = dict.fromkeys((*config.grid, *(name for one in config.list for name in one)))
-    said = (f"{name}={json.dumps(own[name])}" for name in swept)
-    return " ".join((trial.key, *said, f"seed={trial.seed}"))
 
 
 def _print_end(planned: Plan, rows: dict[str, StoredRow], out: Path, console: Console) -> None:
