@@ -55,7 +55,7 @@ class Equal:
 
     def __str__(self) -> str:
         low, high = (self.words(value) for value in self.interval)
-        return f"{self.words(self.images)} ({low} to {high})"
+        return self.short if low == high == self.short else f"{self.short} ({low} to {high})"
 
     @property
     def short(self) -> str:

@@ -6,8 +6,9 @@ outliers) as `sfm-calib calibrate` does, alone or with views of a board as `--bo
 them; and from N views of a board (54 corners, 0.1 px noise, bent and misprinted as its description
 expects) as `sfm-calib target` does. Each is held against the truth: px rms over both pictures
 after the best rotation of each camera, focal length, and how the cameras sit. A scan equals the
-set of 25 views at the length from which on its px, rms over the seeds, is no larger. Of the stated
-covariance of scans the jackknife is left out: nothing here errs in blocks of frames.
+set of 25 views at the length from which on its px is no larger: those px that its covariance lets
+expect, rms over the seeds, for chance makes of the errors of some seeds what it likes. That errors
+are as stated is measured too. Of scans the jackknife is left out: nothing errs in blocks of frames.
 Expectation: by the count of measurements, each weighed by its noise, 25 views of 54 corners are
 25 x 54 / 200 x (0.5 / 0.1)^2 = 169 images of 200 features, whatever the motion, to a factor of two.
 Source: the usual 20 to 30 images of a board (tutorials of OpenCV and MATLAB); the count is ours.
@@ -27,10 +28,14 @@ from experiments.equal_length import Curve, Equal, equal
 from experiments.runner.figures import Series, lines
 from experiments.runner.protocol import Answer, AnswerFigure, AnswerTable, Finished, Study
 from experiments.targetless_trial import BOARD, TargetlessOptions, trial
+from sfm_calib.report.theme import camera_colour
 
 SET_VIEWS = 25  # of the board set that a scan is to equal
 FACTOR = 2.0  # to which the count of measurements is expected to hold
-FEWEST_SEEDS = 4  # of a length: fewer do not say how far errors scatter
+FEWEST_SEEDS = 4  # of a length: fewer do not say how far they scatter
+# Errors over what is stated of them: beyond it lengths by what is stated are not to be believed.
+AS_STATED = (0.8, 1.25)
+SHOWN_IMAGES = 50  # at which px are said too
 
 Some = Sequence[Finished[TargetlessOptions]]
 
@@ -90,15 +95,17 @@ class Kind:
 
 @dataclass(frozen=True)
 class Equalled:
-    """A kind of scan beside the board set."""
+    """A kind of scan beside the board set: where it equals it by what is stated, and by errors."""
 
     kind: Kind
-    equal: Equal
-    stated: Equal  # by what is stated of both
+    px: Equal
+    focal: Equal
+    rotation: Equal
+    by_errors: Equal  # in px
 
     @property
     def as_counted(self) -> bool:
-        low, high = self.equal.interval
+        low, high = self.px.interval
         return low <= FACTOR * self.kind.counted and high >= self.kind.counted / FACTOR
 
 
@@ -114,15 +121,35 @@ def answer(trials: Some) -> Answer:
     if not alone:
         what = f"no scan and set of {SET_VIEWS} board views among {len(trials)} trials"
         return Answer(f"too little to say: {what} went well", None, tuple(tables))
+    ratio, chance = errors_over_stated(kinds)
     few = min(kind.fewest for kind in kinds) < FEWEST_SEEDS
-    holds = None if few else all(one.as_counted for one in alone)
-    begin = "too few seeds to say" if few else "yes" if holds else "no"
+    untold = not AS_STATED[0] < ratio < AS_STATED[1]
+    holds = None if few or untold else all(one.as_counted for one in alone)
+    begin = "yes" if holds else "no"
+    if few or untold:
+        begin = "too few seeds to say" if few else "errors are not as stated"
     return Answer(
-        f"{begin}: {in_words(alone, found, kinds)}",
+        f"{begin}: {in_words(alone, found, kinds)}; errors are {ratio:.2f} ± {chance:.2f} times as "
+        "stated",
         holds,
         (equal_table(found), *tables),
         figures(kinds),
     )
+
+
+def errors_over_stated(kinds: Sequence[Kind]) -> tuple[float, float]:
+    """Of px, rms over all trials, and its standard error: trials of one seed go together."""
+    squares: dict[int, list[float]] = {}
+    for kind in kinds:
+        for one in kind.trials:
+            px: Any = one.row["px"]
+            stated: Any = one.row["px_stated"]
+            squares.setdefault(one.seed, []).append((px / stated) ** 2)
+    means = [float(np.mean(some)) for some in squares.values()]
+    ratio = float(np.sqrt(np.mean(means)))
+    if len(means) < 2:
+        return ratio, float("inf")
+    return ratio, float(np.std(means, ddof=1)) / len(means) ** 0.5 / (2 * ratio)
 
 
 def kinds_of(trials: Some) -> list[Kind]:
@@ -156,10 +183,9 @@ def equalled(kind: Kind, kinds: Sequence[Kind]) -> Equalled | None:
     boards = board_set(kinds, kind.options.corner_sigma_px)
     if kind.options.source == "boards" or boards is None:
         return None
-    by_error, by_stated = (
-        equal(kind.curve(column), boards.curve(column), SET_VIEWS) for column in ("px", "px_stated")
-    )
-    return Equalled(kind, by_error, by_stated)
+    columns = ("px_stated", "sigma_focal_percent", "sigma_rotation_deg", "px")
+    found = [equal(kind.curve(name), boards.curve(name), SET_VIEWS) for name in columns]
+    return Equalled(kind, *found)
 
 
 # ---- words ---------------------------------------------------------------------------------
@@ -169,31 +195,36 @@ def in_words(alone: Sequence[Equalled], found: Sequence[Equalled], kinds: Sequen
     """The numbers that decide, in one line."""
     boards = board_set(kinds, alone[0].kind.options.corner_sigma_px)
     assert boards is not None
-    level = boards.curve().rms(SET_VIEWS)
+    level = boards.curve("px_stated").rms(SET_VIEWS)
     parts = [
-        f"a scan equals {SET_VIEWS} board views ({level:.3f} px) at images (counting says): "
-        + ", ".join(f"{one.kind.name} {one.equal} ({one.kind.counted:.0f})" for one in alone)
+        f"a scan equals {SET_VIEWS} board views ({level:.2f} px) at images (by counting): "
+        + ", ".join(f"{one.kind.name} {one.px} ({one.kind.counted:.0f})" for one in alone)
     ]
-    for first in alone:
-        beside = [
-            one
-            for one in found
-            if one.kind.options.board_views
-            and one.kind.options.model_copy(update={"board_views": 0}) == first.kind.options
-        ]
-        if beside:
-            views = ", ".join(str(one.kind.options.board_views) for one in beside)
-            lengths = ", ".join(one.equal.short for one in beside)
-            parts.append(f"{first.kind.name} with {views} board views: {lengths}")
-    z = [_ratio(one) for kind in kinds for one in kind.trials]
-    parts.append(f"errors are {np.sqrt(np.mean(np.square(z))):.2f} times as stated")
+    joined = [said for one in alone if (said := _with_boards(one, found)) is not None]
+    if joined:
+        parts.append(f"with board views too: {', '.join(joined)}")
     return "; ".join(parts)
 
 
-def _ratio(one: Finished[TargetlessOptions]) -> float:
-    px: Any = one.row["px"]
-    stated: Any = one.row["px_stated"]
-    return float(px / stated)
+def _with_boards(alone: Equalled, found: Sequence[Equalled]) -> str | None:
+    """What views of a board change in scans of a kind; None where there are no such scans."""
+    beside = [
+        one
+        for one in found
+        if one.kind.options.board_views
+        and one.kind.options.model_copy(update={"board_views": 0}) == alone.kind.options
+    ]
+    if not beside:
+        return None
+    views = ", ".join(str(one.kind.options.board_views) for one in beside)
+    lengths = [one.px.short for one in beside]
+    same = len(set(lengths)) == 1
+    said = f"{alone.kind.name} + {views}: {lengths[0] if same else ', '.join(lengths)}"
+    curves = [one.kind.curve("px_stated") for one in (alone, *beside)]
+    if all(SHOWN_IMAGES in curve.images for curve in curves):
+        px = [f"{curve.rms(SHOWN_IMAGES):.2f}" for curve in curves]
+        said += f" (of {SHOWN_IMAGES} images {px[0]} px become {', '.join(px[1:])})"
+    return said
 
 
 # ---- tables and figures --------------------------------------------------------------------
@@ -202,28 +233,30 @@ def _ratio(one: Finished[TargetlessOptions]) -> float:
 def equal_table(found: Sequence[Equalled]) -> AnswerTable:
     """A row a kind of scan."""
     columns = (
-        "scan", "motion", "features", "board views", "images", "from", "to", "by stated sigmas",
-        "by counting",
+        "scan", "motion", "features", "board views", "images", "from", "to", "by errors", "from",
+        "to", "for the focal length", "for the rotation", "by counting",
     )  # fmt: skip
-    rows = []
-    for one in found:
-        options, (low, high) = one.kind.options, one.equal.interval
-        limits = tuple(one.equal.words(value) for value in (low, high))
-        alone = None if options.board_views else one.kind.counted
-        rows.append(
-            (
-                one.kind.name,
-                options.motion,
-                options.features,
-                options.board_views,
-                one.equal.short,
-                *limits,
-                one.stated.short,
-                alone,
-            )
+    rows = tuple(
+        (
+            one.kind.name,
+            one.kind.options.motion,
+            one.kind.options.features,
+            one.kind.options.board_views,
+            *_with_interval(one.px),
+            *_with_interval(one.by_errors),
+            one.focal.short,
+            one.rotation.short,
+            None if one.kind.options.board_views else one.kind.counted,
         )
+        for one in found
+    )
     title = f"Images of each camera with which a scan equals {SET_VIEWS} views of a board"
-    return AnswerTable("equal", title, columns, tuple(rows))
+    return AnswerTable("equal", title, columns, rows)
+
+
+def _with_interval(one: Equal) -> tuple[str, str, str]:
+    low, high = one.interval
+    return one.short, one.words(low), one.words(high)
 
 
 MEASURED = (
@@ -269,18 +302,21 @@ def figures(kinds: Sequence[Kind]) -> tuple[AnswerFigure, ...]:
 
 
 def _figure(name: str, title: str, kinds: Sequence[Kind]) -> AnswerFigure:
-    series = []
+    series, dots = [], []
     for kind in kinds:
-        curve = kind.curve()
-        bars = [curve.rms_error(n) for n in curve.images]
-        finite = [bar if np.isfinite(bar) else 0.0 for bar in bars]
-        series.append(Series(kind.name, curve.images, [curve.rms(n) for n in curve.images], finite))
+        stated, curve = kind.curve("px_stated"), kind.curve()
+        level = [stated.rms(n) for n in stated.images]
+        series.append(Series(kind.name, stated.images, level))
+        dots.append((curve.images, [curve.rms(n) for n in curve.images]))
     boards = board_set(kinds, kinds[0].options.corner_sigma_px)
-    level = None if boards is None else boards.curve().rms(SET_VIEWS)
-    figure = lines(series, "images of each camera", "px rms", True, True, level, 460)
+    at = None if boards is None else boards.curve("px_stated").rms(SET_VIEWS)
+    figure = lines(series, "images of each camera", "px rms", True, True, at, 460)
+    for index, (images, px) in enumerate(dots):
+        marker = {"color": camera_colour(index), "symbol": "x-thin-open", "size": 8}
+        figure.add_scatter(x=images, y=px, mode="markers", marker=marker, showlegend=False)
     caption = (
-        f"Error over both pictures. Dotted: {SET_VIEWS} views of a board alone; a scan equals them "
-        "where it crosses that line. Bars: a standard error over the seeds."
+        f"Error over both pictures: lines as stated, crosses as it was. Dotted: {SET_VIEWS} views "
+        "of a board alone; a scan equals them where its line crosses that."
     )
     return AnswerFigure(name, title, caption, figure)
 

@@ -62,4 +62,6 @@ def test_the_interval_holds_the_length_and_narrows_with_seeds() -> None:
 def test_in_words() -> None:
     assert str(Equal(47.3, (40.0, float("inf")), 10, 80)) == "47 (40 to more than 80)"
     assert str(Equal(0.0, (0.0, 11.8), 10, 80)) == "10 or fewer (10 or fewer to 12)"
+    assert str(Equal(1e9, (float("inf"),) * 2, 10, 80)).startswith("1000000000 (more than 80 to")
+    assert str(Equal(float("inf"), (float("inf"),) * 2, 10, 80)) == "more than 80"
     assert Equal(float("inf"), (20.0, float("inf")), 10, 80).short == "more than 80"

@@ -34,22 +34,24 @@ def options(**given: Any) -> TargetlessOptions:
     return TargetlessOptions.model_validate(given)
 
 
-def finished(one: TargetlessOptions, seed: int, px: float, stated: float | None = None) -> Any:
+def finished(one: TargetlessOptions, seed: int, stated: float, ratio: float = 1.0) -> Any:
+    """A calibration that states an error, and errs by a ratio of that."""
+    px, metric = ratio * stated, one.board_views > 0 or one.source == "boards"
     row = {
         "px": px,
-        "px_stated": px if stated is None else stated,
+        "px_stated": stated,
         "focal_percent": [px, -px],
-        "sigma_focal_percent": [px, px],
+        "sigma_focal_percent": [stated, stated],
         "rotation_deg": px,
-        "sigma_rotation_deg": px,
-        "baseline_percent": px if one.board_views else None,
-        "sigma_baseline_percent": px if one.board_views else None,
+        "sigma_rotation_deg": stated,
+        "baseline_percent": px if metric else None,
+        "sigma_baseline_percent": stated if metric else None,
     }
     return Finished(one, seed, row, 1.0)
 
 
-def made(equal_at: float, seeds: int = 8, stated: float = 1.0, **given: Any) -> Trials:
-    """Scans that equal the board set at a length, and that board set."""
+def made(equal_at: float, seeds: int = 8, ratio: float = 1.0, **given: Any) -> Trials:
+    """That board set, and scans that equal it at a length, by what they state."""
     rng = np.random.default_rng(0)
     found = [
         finished(options(source="boards", images=SET_VIEWS), seed, LEVEL) for seed in range(seeds)
@@ -57,7 +59,7 @@ def made(equal_at: float, seeds: int = 8, stated: float = 1.0, **given: Any) -> 
     for images in IMAGES:
         for seed in range(seeds):
             px = LEVEL * (equal_at / images) ** 0.5 * (1 + 0.05 * rng.standard_normal())
-            found.append(finished(options(images=images, **given), seed, px, stated * px))
+            found.append(finished(options(images=images, **given), seed, px, ratio))
     return found
 
 
@@ -79,7 +81,7 @@ def test_the_count_holds_within_a_factor_of_two(equal_at: float, holds: bool) ->
     found = answer(made(equal_at))
     assert found.holds is holds
     assert found.verdict.startswith("yes: " if holds else "no: ")
-    assert "handheld, 200 features" in found.verdict and "0.100 px" in found.verdict
+    assert "handheld, 200 features" in found.verdict and "(0.10 px)" in found.verdict
     row = dict(zip(found.tables[0].columns, found.tables[0].rows[0], strict=True))
     if 20 < equal_at < 400:
         assert float(row["images"]) == pytest.approx(equal_at, rel=0.06)  # type: ignore[arg-type]
@@ -96,20 +98,25 @@ def test_board_views_beside_a_scan_are_told_apart() -> None:
     trials = [*made(169), *made(60, board_views=2)[8:], *made(30, board_views=5)[8:]]
     found = answer(trials)
     assert found.holds is True  # what is expected is said of scans alone
-    assert "handheld, 200 features with 2, 5 board views: 56, 29;" in found.verdict
+    assert "handheld, 200 features + 2, 5: 56, 29 (of 50 images" in found.verdict
     assert [one.name for one in found.figures] == ["alone", "with_boards_handheld_200"]
     table = found.tables[1]
     at = table.columns.index("baseline %")
-    assert {row[at] is None for row in table.rows if "+" not in str(row[0])} == {True}
-    assert all(row[at] is not None for row in table.rows if "+" in str(row[0]))
+    scans = [row for row in table.rows if row[0] != "board views alone"]
+    assert {row[at] is None for row in scans if "+" not in str(row[0])} == {True}
+    assert all(row[at] is not None for row in scans if "+" in str(row[0]))
 
 
-def test_what_is_stated_is_held_against_the_errors() -> None:
-    assert "errors are 1.00 times as stated" in answer(made(169)).verdict
-    lied = answer(made(169, stated=0.5))
-    assert "errors are 1.8" in lied.verdict  # those of the boards as stated
-    row = dict(zip(lied.tables[0].columns, lied.tables[0].rows[0], strict=True))
-    assert float(row["by stated sigmas"]) == pytest.approx(169 / 4, rel=0.1)  # type: ignore[arg-type]
+def test_errors_that_are_not_as_stated_say_nothing() -> None:
+    good = answer(made(169))
+    assert "errors are 1.00 ± 0.00 times as stated" in good.verdict
+    wrong = answer(made(169, ratio=2.0))
+    assert wrong.holds is None and wrong.verdict.startswith("errors are not as stated: ")
+    # those of the boards are: 40 scans of 48 calibrations err by 2
+    assert f"{((40 * 4 + 8) / 48) ** 0.5:.2f} ± 0.00 times" in wrong.verdict
+    row = wrong.tables[0].rows[0]
+    assert float(row[4]) == pytest.approx(169, rel=0.06)  # type: ignore[arg-type]
+    assert row[7] == "more than 400"  # by errors, 676
 
 
 def test_of_little_nothing_is_said() -> None:
