@@ -161,12 +161,13 @@ def broken(summary: Summary) -> list[str]:
 
 def in_words(summaries: Sequence[Summary]) -> str:
     """The numbers that decide, over all cases, in one line."""
-    parts = [f"{sum(one.scans for one in summaries)} scans"]
+    means = []
     for noise in dict.fromkeys(one.noise for one in summaries):
         some = [one for one in summaries if one.noise == noise]
-        means = [one.nees_stated[0] for one in some]
         chance = max(one.chance for one in some)
-        parts.append(f"NEES {_range(means, '.2f')} (± {chance:.2f}) under {noise} noise")
+        values = _range([one.nees_stated[0] for one in some], ".2f")
+        means.append(f"{values} (± {chance:.2f}) under {noise} noise")
+    parts = [f"{sum(one.scans for one in summaries)} scans", f"NEES {', '.join(means)}"]
     covered = [100 * one.coverage[ALL] for one in summaries]
     parts.append(f"95 % intervals hold {_range(covered, '.1f')} % of the truths")
     bounded = [one for one in summaries if one.of_bound_paired]

@@ -233,8 +233,8 @@ def _with_boards(alone: Equalled, found: Sequence[Equalled]) -> str | None:
 def equal_table(found: Sequence[Equalled]) -> AnswerTable:
     """A row a kind of scan."""
     columns = (
-        "scan", "motion", "features", "board views", "images", "from", "to", "by errors", "from",
-        "to", "for the focal length", "for the rotation", "by counting",
+        "scan", "motion", "features", "board views", "images", "from", "to", "by errors",
+        "errors from", "errors to", "for the focal length", "for the rotation", "by counting",
     )  # fmt: skip
     rows = tuple(
         (
