@@ -119,10 +119,9 @@ def verdict(cases: Sequence[Case], within: Sequence[bool]) -> str:
             f"reprojection falls as claimed where distortion moves the corners by "
             f"{min(bridge):.2g} to {max(bridge):.2g} px"
         )
-    apart = [t.row["joint_less_opencv_px"] for c in cases for t in c.trials]
-    said.append(
-        f"ours and OpenCV's optimum at most {max(each for each in apart if isinstance(each, float)):.1g} px apart"
-    )
+    all_apart = [t.row["joint_less_opencv_px"] for c in cases for t in c.trials]
+    apart = max(each for each in all_apart if isinstance(each, float))
+    said.append(f"ours and OpenCV's optimum at most {apart:.1g} px apart")
     return ("yes: " if all(within) else "no: ") + "; ".join(said)
 
 
