@@ -179,7 +179,8 @@ def worse(cases: Sequence[Case], usual: Any) -> list[str]:
 def cases_table(cases: Sequence[Case]) -> AnswerTable:
     """A row a case."""
     columns = (
-        "source", "number", "tilt deg", "coverage", "distance m", "printed", "trials", "failed", "off px", "±",
+        "source", "number", "tilt deg", "coverage", "distance m", "printed", "trials",
+        "failed", "off px", "±",
         "stated px", "off / stated", "± of it", "NEES", "± of NEES", "focal RMSE px",
         "centre RMSE px", "picture seen",
     )  # fmt: skip
@@ -192,7 +193,8 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
             float(case.column("seen").mean()),
         )  # fmt: skip
         rows.append((
-            o.source, o.views, o.tilt_deg, o.coverage, o.distance_m, o.printed, len(case.trials), case.failed,
+            o.source, o.views, o.tilt_deg, o.coverage, o.distance_m, o.printed,
+            len(case.trials), case.failed,
             *(number if np.isfinite(number) else None for number in numbers),
         ))  # fmt: skip
     return AnswerTable(
