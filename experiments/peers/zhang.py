@@ -58,7 +58,7 @@ def calibrate(views: BoardViews, corners: FloatArray, options: ZhangOptions) -> 
     straight = [view.pixels for view in views.views]
     for _ in range(options.alternations + 1):
         camera, boards = _from_straight(name, size, views.views, straight, corners, options)
-        camera = _with_distortion(camera, boards, views.views, corners)
+        camera = with_distortion(camera, boards, views.views, corners)
         straight = [_straightened(camera, view.pixels) for view in views.views]
     found = PeerCalibration(
         "Zhang", (camera,), (Transform.identity(),),
@@ -176,7 +176,7 @@ def board_from_homography(H: FloatArray) -> Transform:
     return Transform(left @ right, shift)
 
 
-def _with_distortion(
+def with_distortion(
     camera: Camera, boards: Sequence[Transform], views: Sequence[BoardView], corners: FloatArray
 ) -> Camera:
     """k1 and k2 by linear least squares of the pixels (eq. 13)."""
