@@ -89,7 +89,7 @@ def answered(trials: Trials, usual: TrialOptions) -> Answer:
         low - STANDARD_ERRORS * error <= value <= high + STANDARD_ERRORS * error
         for value, error in known
     ]
-    return Answer(verdict(cases, within), all(within), tables, figures(cases, usual))
+    return Answer(verdict(cases, usual, within), all(within), tables, figures(cases, usual))
 
 
 def cases_of(trials: Trials) -> list[Case]:
@@ -102,22 +102,25 @@ def cases_of(trials: Trials) -> list[Case]:
     return sorted(cases, key=lambda c: (c.corner_px, c.options.sigma_px, c.options.views))
 
 
-def verdict(cases: Sequence[Case], within: Sequence[bool]) -> str:
-    """One line with the falls that decide."""
-    said = [f"{sum(within)} of {len(within)} falls lie in {CLAIM[0]:.0%} to {CLAIM[1]:.0%}"]
-    usual = max(cases, key=lambda case: len(case.trials))
-    same = [c for c in cases if (c.options.views, c.options.sigma_px)
-            == (usual.options.views, usual.options.sigma_px)]  # fmt: skip
-    for case in dict.fromkeys((cases.index(same[0]), cases.index(same[-1]))):
+def verdict(cases: Sequence[Case], usual: Any, within: Sequence[bool]) -> str:
+    """One line with the falls that decide: with least and most distortion, the rest as usual."""
+    said = [
+        f"{len(within) - sum(within)} of {len(within)} falls lie outside {100 * CLAIM[0]:.0f} to "
+        f"{100 * CLAIM[1]:.0f} %"
+    ]
+    same = [c for c in cases if c.options.views == usual.views
+            and c.options.sigma_px == usual.sigma_px] or list(cases)  # fmt: skip
+    for case in same if len(same) < 2 else (same[0], same[-1]):
         falls = ", ".join(
-            f"{name.replace('_', ' ')} {_percent(cases[case].fall(name))}" for name in MEASURES
+            f"{name.replace('_', ' ')} {_percent(case.fall(name))}" for name in MEASURES
         )
-        said.append(f"{cases[case].named}: {falls}")
+        said.append(f"{case.named}: {falls}")
     bridge = [c.corner_px for c in same if CLAIM[0] <= c.fall("rms")[0] <= CLAIM[1]]
     if bridge:
+        least, most = f"{min(bridge):.2g}", f"{max(bridge):.2g}"
         said.append(
-            f"reprojection falls as claimed where distortion moves the corners by "
-            f"{min(bridge):.2g} to {max(bridge):.2g} px"
+            "the reprojection rms falls as claimed where distortion moves the corners by "
+            + (f"{least} px" if least == most else f"{least} to {most} px")
         )
     all_apart = [t.row["joint_less_opencv_px"] for c in cases for t in c.trials]
     apart = max(each for each in all_apart if isinstance(each, float))
