@@ -74,7 +74,7 @@ class ZhangStudyOptions(TrialOptions):
     sigma_px: Annotated[float, Field(gt=0, le=10)] = 0.3
     """Noise of the corners."""
     distortion: Annotated[float, Field(ge=-1, le=3)] = 1.0
-    """Of the camera, in units of an ordinary lens's: 1 moves the picture's corners by 31 px."""
+    """Of the camera, in units of an ordinary lens's: 1 moves the picture's corners by 33 px."""
     tilt_deg: tuple[float, float] = (0.0, 45.0)
     """Of the board against the image plane."""
 
