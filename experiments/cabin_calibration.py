@@ -1,0 +1,180 @@
+"""The cabin of `depth_camera_cabin` calibrated: by boards, by a scan, by a scan and one board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from graphs.boards import corners_of
+from graphs.frames import FloatArray
+from graphs.jackknife import change
+from graphs.problem import Estimate, KnownBaseline
+from graphs.refine import Refinement
+from graphs.stated_covariance import calibration_covariance
+from sfm_calib.anchors import SeenBoards, anchored
+from sfm_calib.boards.spec import Checkerboard
+from sfm_calib.boards.views import BoardViews
+from sfm_calib.calibrate import refusals, solve_problem
+from sfm_calib.config import CameraConfig, RigConfig
+from sfm_calib.simulate.board_views import (
+    BoardViewOptions,
+    corners_seen,
+    place_board,
+    scan_of,
+)
+from sfm_calib.simulate.cabin import HEAD_M, Cabin
+from sfm_calib.simulate.carried import CarryOptions, carry_box
+from sfm_calib.simulate.rigs import SimulatedRig
+from sfm_calib.target import graph_board, started_problem
+
+Way = Literal["boards", "scan", "scan_board"]
+Scale = Literal["tape", "none"]
+
+# The study's squares; 9 x 6 of them, on A3. As large and as flat as our own description believes; single
+# corners are where they belong, or a solve would take ten times as long.
+BOARD = Checkerboard(inner_corners=(8, 5), square_m=0.036, corner_sigma_m=0.0)
+CORNER_PX = 0.2  # noise of a corner
+TAPE_M = 0.005  # sigma of a tape between two housings, whose lenses' centres nobody sees
+# Cameras by index, infrared and colour of front, right and left. A device is shown the board on
+# its own, or together with the front one; right and left face each other.
+DEVICES = ((0, 1), (2, 3), (4, 5))
+PAIRS = ((0, 1, 2, 3), (0, 1, 4, 5))
+FAR = (0, 4)  # the front and left infrared cameras, between which the tape is held
+ALONE = BoardViewOptions(distance_m=(0.45, 0.9), tilt_deg=(0.0, 45.0), least_seen=0.7)
+# The board faces halfway between two devices, 40 to 45 degrees off both axes already.
+TOGETHER = BoardViewOptions(
+    distance_m=(0.5, 0.9), tilt_deg=(0.0, 25.0), coverage=0.6, least_seen=0.7
+)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What came of it, in metres, beside the truth and its own covariance."""
+
+    rig: SimulatedRig
+    names: tuple[str, ...]  # of the parameters that were free
+    error: FloatArray  # (n,) of each; without a scale, lengths in units of the longest baseline
+    cov: FloatArray  # (n, n) stated
+
+    @property
+    def z(self) -> FloatArray:
+        """Errors (n,) in sigmas."""
+        result: FloatArray = self.error / np.sqrt(np.diag(self.cov))
+        return result
+
+    @property
+    def nees(self) -> float:
+        """Normalised squared error a parameter: 1 on average where the covariance is right."""
+        sigma = np.sqrt(np.diag(self.cov))
+        z = self.z
+        return float(z @ np.linalg.solve(self.cov / np.outer(sigma, sigma), z)) / len(z)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How often the board is shown: to each device alone, and to each pair of devices."""
+
+    alone: int
+    together: int
+
+
+def calibrate_cabin(
+    cabin: Cabin,
+    way: Way,
+    shown: Shown,
+    carry: CarryOptions,
+    scale: Scale,
+    held: bool,
+    rng: np.random.Generator,
+) -> Calibrated:
+    """Calibrate a cabin as its user would.
+
+    scale: of a scan alone; where a board is shown, that gives it. held: the lenses stay as the
+    factory has them. Raises CalibrationError where the views do not allow it.
+    """
+    config = config_of(cabin, held)
+    if way == "boards":
+        views = show_board(cabin, shown, rng)
+        problem = started_problem(views, BOARD, config, scan_of(views))[1]
+        return judged(cabin, solve_problem(problem, config, _unsaid))
+    kinds = (cabin.infrared, cabin.colour)
+    problem, _ = carry_box(carry, cabin.true, cabin.nominal, kinds, np.array(HEAD_M), rng)
+    if way == "scan" and scale == "tape":
+        problem = replace(problem, scales=(taped(cabin, rng),))
+    found = solve_problem(problem, config, _unsaid)
+    if way == "scan":
+        return judged(cabin, found)
+    views = show_board(cabin, Shown(0, shown.together), rng)
+    with refusals():
+        joined, _ = anchored(found, BOARD, SeenBoards(replace(views, views=()), views, ()))
+    return judged(cabin, solve_problem(joined, config, _unsaid))
+
+
+def config_of(cabin: Cabin, held: bool) -> RigConfig:
+    """What rig.yaml says: the lens model; where they are held, all that the factory says."""
+    lenses = {
+        camera.name: CameraConfig(lens="brown", params=camera.named(), fixed=camera.names)
+        for camera in cabin.nominal.cameras
+    }
+    reference = cabin.true.cameras[0].name
+    return RigConfig(lens="brown", reference=reference, cameras=lenses if held else {})
+
+
+def show_board(cabin: Cabin, shown: Shown, rng: np.random.Generator) -> BoardViews:
+    """What every camera finds of a board that is off its description as that believes."""
+    rig, known = cabin.true, graph_board(BOARD)
+    shape = known.shape_sigma * rng.standard_normal(known.shape_sigma.size)
+    corners = corners_of(known, shape)[0]
+    asked = [(group, ALONE) for group in DEVICES for _ in range(shown.alone)]
+    asked += [(group, TOGETHER) for group in PAIRS for _ in range(shown.together)]
+    places = [place_board(rig, group, corners, how, rng) for group, how in asked]
+    return BoardViews(
+        tuple(camera.name for camera in rig.cameras),
+        tuple(camera.size for camera in rig.cameras),
+        tuple(f"board{frame:03d}" for frame in range(len(places))),
+        corners_seen(rig, places, corners, CORNER_PX, rng),
+    )
+
+
+def taped(cabin: Cabin, rng: np.random.Generator) -> KnownBaseline:
+    """The longest distance between two devices, as a tape has it."""
+    length_m = far_m(cabin.true) + TAPE_M * rng.standard_normal()
+    return KnownBaseline(FAR, length_m, TAPE_M)
+
+
+def far_m(rig: SimulatedRig) -> float:
+    """Distance of the cameras between which the tape is held."""
+    a, b = (rig.cam_from_rig[camera].inverse.translation for camera in FAR)
+    return float(np.linalg.norm(a - b))
+
+
+def judged(cabin: Cabin, found: Refinement) -> Calibrated:
+    """A result in metres, and its errors against what it states.
+
+    Without a scale its lengths are those of the rig by hand. No jackknife: errors that frames
+    share, which it looks for, are not simulated, and it takes ten solves.
+    """
+    covariance = calibration_covariance(found.graph, found.estimate, found.values)
+    names, unit = covariance.stated.names, covariance.basis.unit_camera
+    estimate = found.estimate
+    true = Estimate(cabin.true.cameras, cabin.true.cam_from_rig, (), np.zeros((0, 3)))
+    alike = replace(estimate, rig_from_world=(), points=true.points)
+    if found.problem.metric:
+        error = change(true, alike, names)
+    else:
+        assert unit is not None
+        error = change(_in_unit(true, unit), _in_unit(alike, unit), names)
+        own = SimulatedRig(estimate.cameras, estimate.cam_from_rig)
+        alike = alike.scaled(far_m(cabin.nominal) / far_m(own))
+    rig = SimulatedRig(alike.cameras, alike.cam_from_rig)
+    return Calibrated(rig, names, error, covariance.stated.matrix)
+
+
+def _in_unit(estimate: Estimate, camera: int) -> Estimate:
+    return estimate.scaled(1 / float(np.linalg.norm(estimate.cam_from_rig[camera].translation)))
+
+
+def _unsaid(stage: str, done: int, total: int) -> None:
+    pass
