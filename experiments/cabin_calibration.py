@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from experiments.runner.protocol import TrialOptions
 from graphs.boards import corners_of
 from graphs.frames import FloatArray
 from graphs.jackknife import change
-from graphs.problem import Estimate, KnownBaseline
+from graphs.problem import Estimate, KnownBaseline, Problem
 from graphs.refine import Refinement
-from graphs.stated_covariance import calibration_covariance
+from graphs.stated_covariance import calibration_covariance, factors
 from sfm_calib.anchors import SeenBoards, anchored
 from sfm_calib.boards.spec import Checkerboard
 from sfm_calib.boards.views import BoardViews
@@ -29,8 +31,7 @@ from sfm_calib.simulate.carried import CarryOptions, carry_box
 from sfm_calib.simulate.rigs import SimulatedRig
 from sfm_calib.target import graph_board, started_problem
 
-Way = Literal["boards", "scan", "scan_board"]
-Scale = Literal["tape", "none"]
+POINTS_A_FEATURE = 16  # on the box, for each that one image of it has: it is seen from all sides
 
 # The study's squares; 9 x 6 of them, on A3. As large and as flat as our own description believes; single
 # corners are where they belong, or a solve would take ten times as long.
@@ -49,9 +50,50 @@ TOGETHER = BoardViewOptions(
 )
 
 
+class CabinOptions(TrialOptions):
+    """One cabin, calibrated in one way, and one head that it takes."""
+
+    way: Literal["none", "boards", "scan", "scan_board"] = "boards"
+    """What it is calibrated by."""
+    intrinsics: Literal["factory", "calibrated", "true"] = "calibrated"
+    """Lenses that depth becomes points by. With calibrated places, factory lenses are held while
+    these are found."""
+    extrinsics: Literal["hand", "calibrated", "true"] = "calibrated"
+    """Places that clouds are put together by."""
+    scale: Literal["tape", "none"] = "tape"
+    """What gives a scan its lengths; none: the places by hand."""
+    hand_deg: Annotated[float, Field(ge=0, le=30)] = 2.0
+    """Rms of how far the side devices are turned from their places by hand."""
+    hand_mm: Annotated[float, Field(ge=0, le=300)] = 20.0
+    """And of how far they are shifted."""
+    alone: Annotated[int, Field(ge=3, le=200)] = 30
+    """Views of the board by each device, of way boards."""
+    together: Annotated[int, Field(ge=1, le=200)] = 20
+    """Views by each pair of devices, of way boards."""
+    added: Annotated[int, Field(ge=1, le=50)] = 1
+    """Views by each pair of devices, of way scan_board."""
+    scan_frames: Annotated[int, Field(ge=10, le=400)] = 60
+    """How often the box is seen in a scan."""
+    features: Annotated[int, Field(ge=20, le=500)] = 60
+    """Features of an image of the box, at most."""
+    feature_px: Annotated[float, Field(gt=0, le=5)] = 0.5
+    """Noise of a feature."""
+    depth_noise: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Noise of depth, times a Kinect's."""
+
+    @model_validator(mode="after")
+    def _calibrated_by_something(self) -> CabinOptions:
+        if self.way == "none" and "calibrated" in (self.intrinsics, self.extrinsics):
+            raise ValueError(
+                "way none calibrates nothing: give intrinsics factory or true and extrinsics hand "
+                "or true, or another way"
+            )
+        return self
+
+
 @dataclass(frozen=True)
 class Calibrated:
-    """What came of it, in metres, beside the truth and its own covariance."""
+    """What came of it, in metres, beside its errors and its own covariance."""
 
     rig: SimulatedRig
     names: tuple[str, ...]  # of the parameters that were free
@@ -60,56 +102,55 @@ class Calibrated:
 
     @property
     def z(self) -> FloatArray:
-        """Errors (n,) in sigmas."""
-        result: FloatArray = self.error / np.sqrt(np.diag(self.cov))
-        return result
+        """Errors (n,) in sigmas; zero of what is exactly known."""
+        sigma = np.sqrt(np.diag(self.cov))
+        return np.divide(self.error, sigma, out=np.zeros_like(sigma), where=sigma > 0)
 
     @property
     def nees(self) -> float:
-        """Normalised squared error a parameter: 1 on average where the covariance is right."""
-        sigma = np.sqrt(np.diag(self.cov))
-        z = self.z
-        return float(z @ np.linalg.solve(self.cov / np.outer(sigma, sigma), z)) / len(z)
+        """Normalised squared error a degree of freedom: 1 on average where the sigmas hold.
+
+        Without a scale one length is the unit, and has no error.
+        """
+        _, whiten = factors(self.cov)
+        return float(((whiten @ self.error) ** 2).sum()) / len(whiten)
 
 
-@dataclass(frozen=True)
-class Shown:
-    """How often the board is shown: to each device alone, and to each pair of devices."""
-
-    alone: int
-    together: int
+# ---- the ways ------------------------------------------------------------------------------
 
 
-def calibrate_cabin(
-    cabin: Cabin,
-    way: Way,
-    shown: Shown,
-    carry: CarryOptions,
-    scale: Scale,
-    held: bool,
-    rng: np.random.Generator,
-) -> Calibrated:
+def calibrate_cabin(cabin: Cabin, options: CabinOptions, rng: np.random.Generator) -> Calibrated:
     """Calibrate a cabin as its user would.
 
-    scale: of a scan alone; where a board is shown, that gives it. held: the lenses stay as the
-    factory has them. Raises CalibrationError where the views do not allow it.
+    Raises CalibrationError where its views do not allow it.
     """
-    config = config_of(cabin, held)
-    if way == "boards":
-        views = show_board(cabin, shown, rng)
+    config = config_of(cabin, held=options.intrinsics == "factory")
+    if options.way == "boards":
+        views = show_board(cabin, options.alone, options.together, rng)
         problem = started_problem(views, BOARD, config, scan_of(views))[1]
         return judged(cabin, solve_problem(problem, config, _unsaid))
-    kinds = (cabin.infrared, cabin.colour)
-    problem, _ = carry_box(carry, cabin.true, cabin.nominal, kinds, np.array(HEAD_M), rng)
-    if way == "scan" and scale == "tape":
+    problem = scanned(cabin, options, rng)
+    if options.way == "scan" and options.scale == "tape":
         problem = replace(problem, scales=(taped(cabin, rng),))
     found = solve_problem(problem, config, _unsaid)
-    if way == "scan":
+    if options.way == "scan":
         return judged(cabin, found)
-    views = show_board(cabin, Shown(0, shown.together), rng)
+    views = show_board(cabin, 0, options.added, rng)
     with refusals():
         joined, _ = anchored(found, BOARD, SeenBoards(replace(views, views=()), views, ()))
     return judged(cabin, solve_problem(joined, config, _unsaid))
+
+
+def scanned(cabin: Cabin, options: CabinOptions, rng: np.random.Generator) -> Problem:
+    """Tracks of a papered box, started from the factory's lenses and the places by hand."""
+    carry = CarryOptions(
+        frames=options.scan_frames,
+        points=POINTS_A_FEATURE * options.features,
+        max_points_per_image=options.features,
+        sigma_px=options.feature_px,
+    )
+    kinds = (cabin.infrared, cabin.colour)
+    return carry_box(carry, cabin.true, cabin.nominal, kinds, np.array(HEAD_M), rng)[0]
 
 
 def config_of(cabin: Cabin, held: bool) -> RigConfig:
@@ -122,13 +163,16 @@ def config_of(cabin: Cabin, held: bool) -> RigConfig:
     return RigConfig(lens="brown", reference=reference, cameras=lenses if held else {})
 
 
-def show_board(cabin: Cabin, shown: Shown, rng: np.random.Generator) -> BoardViews:
-    """What every camera finds of a board that is off its description as that believes."""
+def show_board(cabin: Cabin, alone: int, together: int, rng: np.random.Generator) -> BoardViews:
+    """What every camera finds of a board that is off its description as that believes.
+
+    alone, together: how often it is shown to each device, and to each pair of devices.
+    """
     rig, known = cabin.true, graph_board(BOARD)
     shape = known.shape_sigma * rng.standard_normal(known.shape_sigma.size)
     corners = corners_of(known, shape)[0]
-    asked = [(group, ALONE) for group in DEVICES for _ in range(shown.alone)]
-    asked += [(group, TOGETHER) for group in PAIRS for _ in range(shown.together)]
+    asked = [(group, ALONE) for group in DEVICES for _ in range(alone)]
+    asked += [(group, TOGETHER) for group in PAIRS for _ in range(together)]
     places = [place_board(rig, group, corners, how, rng) for group, how in asked]
     return BoardViews(
         tuple(camera.name for camera in rig.cameras),
