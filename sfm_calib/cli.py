@@ -9,6 +9,8 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,6 +57,9 @@ from sfm_calib.terminal import progress_bars, result_console
 from sfm_calib.undistort_command import Rectify, Undistort, run_rectify, run_undistort
 
 EXIT_BAD_INPUT = 2
+# Packages above this one, such as experiments, bring commands of their own under this name: frozen
+# dataclasses with run(arguments) -> exit code.
+ENTRY_POINTS = "sfm_calib.commands"
 DEMO_FRAMES = 24
 DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the same result
 EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
@@ -85,6 +90,8 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
     )
+    for name, brought in brought_commands().items():
+        commands = commands | Annotated[brought, tyro.conf.subcommand(name)]
     command: Command = tyro.cli(
         commands,
         prog="sfm-calib",
@@ -93,6 +100,12 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     return command
+
+
+@cache
+def brought_commands() -> dict[str, Any]:
+    """Commands of packages above this one, by name."""
+    return {point.name: point.load() for point in entry_points(group=ENTRY_POINTS)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -143,6 +156,9 @@ def quiet_decoders() -> None:
 
 def run(command: Command, arguments: Sequence[str]) -> int:
     """Do what a parsed command asks for; the exit code."""
+    if isinstance(command, tuple(brought_commands().values())):
+        brought: Any = command
+        return int(brought.run(arguments))
     if isinstance(command, Recalibrate):
         return run_recalibrate(command, config_of(command.scan, arguments), arguments)
     if isinstance(command, Calibrate):
