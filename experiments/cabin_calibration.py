@@ -33,8 +33,8 @@ from sfm_calib.target import graph_board, started_problem
 
 POINTS_A_FEATURE = 16  # on the box, for each that one image of it has: it is seen from all sides
 
-# The study's squares; 9 x 6 of them, on A3. As large and as flat as our own description believes; single
-# corners are where they belong, or a solve would take ten times as long.
+# The study's squares; 9 x 6 of them, on A3. It is as large and as flat as our own description
+# believes; single corners are where they belong, or a solve would take ten times as long.
 BOARD = Checkerboard(inner_corners=(8, 5), square_m=0.036, corner_sigma_m=0.0)
 CORNER_PX = 0.2  # noise of a corner
 TAPE_M = 0.005  # sigma of a tape between two housings, whose lenses' centres nobody sees
@@ -55,10 +55,10 @@ class CabinOptions(TrialOptions):
 
     way: Literal["none", "boards", "scan", "scan_board"] = "boards"
     """What it is calibrated by."""
-    intrinsics: Literal["factory", "calibrated", "true"] = "calibrated"
+    intrinsics: Literal["factory", "calibrated", "exact"] = "calibrated"
     """Lenses that depth becomes points by. With calibrated places, factory lenses are held while
     these are found."""
-    extrinsics: Literal["hand", "calibrated", "true"] = "calibrated"
+    extrinsics: Literal["hand", "calibrated", "exact"] = "calibrated"
     """Places that clouds are put together by."""
     scale: Literal["tape", "none"] = "tape"
     """What gives a scan its lengths; none: the places by hand."""
@@ -74,7 +74,7 @@ class CabinOptions(TrialOptions):
     """Views by each pair of devices, of way scan_board."""
     scan_frames: Annotated[int, Field(ge=10, le=400)] = 60
     """How often the box is seen in a scan."""
-    features: Annotated[int, Field(ge=20, le=500)] = 60
+    features: Annotated[int, Field(ge=20, le=500)] = 100
     """Features of an image of the box, at most."""
     feature_px: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Noise of a feature."""
@@ -85,8 +85,8 @@ class CabinOptions(TrialOptions):
     def _calibrated_by_something(self) -> CabinOptions:
         if self.way == "none" and "calibrated" in (self.intrinsics, self.extrinsics):
             raise ValueError(
-                "way none calibrates nothing: give intrinsics factory or true and extrinsics hand "
-                "or true, or another way"
+                "way none calibrates nothing: give intrinsics factory or exact and extrinsics hand "
+                "or exact, or another way"
             )
         return self
 

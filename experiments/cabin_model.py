@@ -7,14 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from experiments.runner.protocol import Row
 from graphs.camera import Camera, unproject
 from graphs.frames import FloatArray, Transform
-from sfm_calib.depth.cloud import Cloud, depth_points, moved
-from sfm_calib.depth.fuse import fuse_clouds
-from sfm_calib.depth.registration import register
+from sfm_calib.depth.cloud import Cloud, depth_points
+from sfm_calib.depth.fuse import fuse_clouds, register
+from sfm_calib.depth.surface import Surface
+from sfm_calib.depth.surface_distance import Distances, align_icp, summary
 from sfm_calib.errors import CalibrationError
 from sfm_calib.simulate.cabin import Cabin, head_place, resized
 from sfm_calib.simulate.depth_image import depth_image, to_be_seen
@@ -24,7 +26,10 @@ from sfm_calib.simulate.rigs import SimulatedRig
 # Depth that a driver registers to the colour camera, at about the infrared camera's resolution:
 # finer it holds nothing more.
 COLOUR_SIZE = 1 / 3
-LAID_ON_M = 0.05  # points this far from the surface still pull when the model is laid on it
+REGISTERED_BY = 2  # every other point tells ICP the same motion in half the time
+# A model is laid on the true head by so many of its points, none farther off it than this.
+MOST_LAID, LAID_ON_M = 2500, 0.03
+DECIMALS = 3  # of a painted distance in mm
 PAINTED = 4  # subdivisions of the head that distances are painted on: 2562 places
 FAILED_MM = 10.0  # parts of a model farther off than this, rms, were not registered
 
@@ -34,6 +39,8 @@ class Taken:
     """A head, and the depth images (height, width) in m that the devices took of it."""
 
     cabin: Cabin
+    head: Surface
+    seen: FloatArray  # (n, 3) its vertices that a device sees
     rig_from_head: Transform
     infrared: tuple[FloatArray, ...]
     colour: tuple[FloatArray, ...]  # the same head in the colour cameras, resized
@@ -44,7 +51,8 @@ def taken(cabin: Cabin, rng: np.random.Generator, noise: float) -> Taken:
 
     Raises CalibrationError where Open3D is missing.
     """
-    surface, rig_from_head = to_be_seen(*make_head()), head_place(rng)
+    head, rig_from_head = Surface(*make_head()), head_place(rng)
+    surface = to_be_seen(head.vertices, head.triangles)
 
     def images(cameras: Sequence[int], size: float) -> tuple[FloatArray, ...]:
         return tuple(
@@ -58,7 +66,11 @@ def taken(cabin: Cabin, rng: np.random.Generator, noise: float) -> Taken:
             for index in cameras
         )
 
-    return Taken(cabin, rig_from_head, images(cabin.infrared, 1), images(cabin.colour, COLOUR_SIZE))
+    infrared = images(cabin.infrared, 1)
+    exact = fuse_clouds(*points_of(infrared, cabin.true, cabin.infrared, 1)).points
+    seen = np.unique(KDTree(head.vertices).query(rig_from_head.inverse @ exact)[1])
+    colour = images(cabin.colour, COLOUR_SIZE)
+    return Taken(cabin, head, head.vertices[seen], rig_from_head, infrared, colour)
 
 
 def model_row(scene: Taken, rig: SimulatedRig) -> Row:
@@ -67,18 +79,21 @@ def model_row(scene: Taken, rig: SimulatedRig) -> Row:
     colour, _ = points_of(scene.colour, rig, scene.cabin.colour, COLOUR_SIZE)
     true, true_places = points_of(scene.infrared, scene.cabin.true, scene.cabin.infrared, 1)
     exact = fuse_clouds(true, true_places)
-    as_placed = fuse_clouds(infrared, places, with_normals=True)
-    registration = register(as_placed)
-    registered = moved(as_placed, registration.transforms)
+    as_placed = fuse_clouds(infrared, places)
+    some = [part[::REGISTERED_BY] for part in infrared]
+    registration = register(fuse_clouds(some, places, with_normals=True))
+    registered = fuse_clouds(infrared, registration.corrected(places))
+    on_head = laid_on_head(scene, as_placed.points)
     return {
         "points": len(as_placed.points),
-        **distances(scene, as_placed.points),
+        **distances(scene, on_head),
+        "painted_mm": painted_mm(scene, on_head),
         "misplaced_mm": misplaced_mm(as_placed, exact),
-        **distances(scene, registered.points, "registered_"),
+        **distances(scene, laid_on_head(scene, registered.points), "registered_"),
         "registered_misplaced_mm": misplaced_mm(registered, exact),
         "refused": sum(registration.failed),
-        **single(scene, infrared, places, "infrared_"),
-        **single(scene, colour, [rig.cam_from_rig[i] for i in scene.cabin.colour], "colour_"),
+        **of_devices(scene, infrared, places, "infrared_"),
+        **of_devices(scene, colour, [rig.cam_from_rig[i] for i in scene.cabin.colour], "colour_"),
     }
 
 
@@ -119,3 +134,60 @@ def misplaced_mm(cloud: Cloud, exact: Cloud) -> float:
     return 1e3 * max(
         float(np.sqrt(square[cloud.camera == camera].mean())) for camera in np.unique(cloud.camera)
     )
+
+
+# ---- distances to the true head ------------------------------------------------------------
+
+
+def laid_on_head(scene: Taken, points: FloatArray) -> FloatArray:
+    """Points (n, 3) in the rig's frame moved as one to where they fit the head best."""
+    some = points[:: max(len(points) // MOST_LAID, 1)]
+    fit = align_icp(some, scene.head, scene.rig_from_head.inverse, LAID_ON_M)
+    return fit.transform @ points
+
+
+def off_head(scene: Taken, on_head: FloatArray) -> Distances:
+    """Of points (n, 3) to the head; without a sign, which takes longer than all else."""
+    return Distances(np.linalg.norm(on_head - scene.head.closest(on_head)[0], axis=1), None)
+
+
+def distances(scene: Taken, on_head: FloatArray, prefix: str = "") -> dict[str, float]:
+    """Of points (n, 3), laid on the head, to it, in mm.
+
+    hausdorff: the larger of the farthest point from the head, and the farthest place of the head,
+    of those that a device saw, from the points.
+    """
+    found = summary(off_head(scene, on_head))
+    missed_m = float(KDTree(on_head).query(scene.seen)[0].max())
+    lengths_m = {
+        "mean": found.mean_m,
+        "rms": found.rms_m,
+        "p95": found.p95_m,
+        "max": found.max_m,
+        "hausdorff": max(found.max_m, missed_m),
+    }
+    return {f"{prefix}{name}_mm": 1e3 * length for name, length in lengths_m.items()}
+
+
+def of_devices(
+    scene: Taken, parts: Sequence[FloatArray], places: Sequence[Transform], prefix: str
+) -> dict[str, float]:
+    """Means over devices, the points (n, 3) of each laid on the head by themselves."""
+    each = [
+        summary(off_head(scene, laid_on_head(scene, at.inverse @ part)))
+        for part, at in zip(parts, places, strict=True)
+    ]
+    return {
+        f"{prefix}mean_mm": 1e3 * float(np.mean([one.mean_m for one in each])),
+        f"{prefix}rms_mm": 1e3 * float(np.mean([one.rms_m for one in each])),
+    }
+
+
+def painted_mm(scene: Taken, on_head: FloatArray) -> list[float]:
+    """Mean distance of the points nearest to each vertex of a coarser head; -1: there are none."""
+    vertices, _ = make_head(PAINTED)
+    off = 1e3 * off_head(scene, on_head).unsigned
+    of = KDTree(vertices).query(on_head)[1]
+    count = np.bincount(of, minlength=len(vertices))
+    mean = np.bincount(of, off, len(vertices)) / np.maximum(count, 1)
+    return [float(value) for value in np.where(count > 0, np.round(mean, DECIMALS), -1.0)]

@@ -25,63 +25,19 @@ Run: sfm-calib run configs/studies/depth_camera_cabin.yaml -o out/depth_camera_c
 from __future__ import annotations
 
 import time
-from typing import Annotated, Literal
+from collections.abc import Sequence
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from experiments.cabin_answer import answer
-from experiments.cabin_calibration import Calibrated, Scale, Shown, Way, calibrate_cabin
-from experiments.cabin_model import Model, measured_model, taken
-from experiments.runner.protocol import Cell, Row, Study, TrialOptions
+from experiments.cabin_calibration import CabinOptions, Calibrated, calibrate_cabin
+from experiments.cabin_model import model_row, taken
+from experiments.runner.protocol import Row, Study
 from graphs.frames import FloatArray, angle_between
-from sfm_calib.simulate.cabin import HEAD_M, Cabin, draw_cabin
-from sfm_calib.simulate.carried import CarryOptions
+from sfm_calib.simulate.cabin import Cabin, draw_cabin
 from sfm_calib.simulate.rigs import SimulatedRig
 
-
-class CabinOptions(TrialOptions):
-    """One cabin, calibrated in one way, and one head that it takes."""
-
-    way: Literal[Way, "none"] = "boards"
-    """What it is calibrated by."""
-    intrinsics: Literal["factory", "calibrated", "true"] = "calibrated"
-    """Lenses that depth is made points with. With calibrated places, factory lenses are held while
-    these are found."""
-    extrinsics: Literal["hand", "calibrated", "true"] = "calibrated"
-    """Places by which clouds are put together."""
-    scale: Scale = "tape"
-    """What gives a scan its lengths; none: the places by hand."""
-    hand_deg: Annotated[float, Field(ge=0, le=30)] = 2.0
-    """Rms of how far the side devices are turned from their places by hand."""
-    hand_mm: Annotated[float, Field(ge=0, le=300)] = 20.0
-    """And of how far they are shifted."""
-    alone: Annotated[int, Field(ge=0, le=200)] = 30
-    """Views of the board by each device, of way boards."""
-    together: Annotated[int, Field(ge=1, le=200)] = 20
-    """Views by each pair of devices, of way boards."""
-    added: Annotated[int, Field(ge=1, le=50)] = 1
-    """Views by each pair of devices, of way scan_board."""
-    scan_frames: Annotated[int, Field(ge=10, le=400)] = 60
-    """How often the box is seen in a scan."""
-    features: Annotated[int, Field(ge=20, le=500)] = 60
-    """Features of an image of the box, at most."""
-    feature_px: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Noise of a feature."""
-    depth_noise: Annotated[float, Field(ge=0, le=20)] = 1.0
-    """Noise of depth, times a Kinect's."""
-
-    @model_validator(mode="after")
-    def _calibrated_by_something(self) -> CabinOptions:
-        if self.way == "none" and "calibrated" in (self.intrinsics, self.extrinsics):
-            raise ValueError("way none calibrates nothing: give intrinsics and extrinsics of "
-                             "factory, hand or true, or another way")  # fmt: skip
-        if self.way == "boards" and self.intrinsics == "calibrated" and self.alone < 3:
-            raise ValueError(f"{self.alone} views do not calibrate a device: give alone 3 or more")
-        return self
-
-
-# ---- one cabin -----------------------------------------------------------------------------
+WITHIN_95 = 1.959964  # sigmas
 
 
 def trial(options: CabinOptions, seed: int) -> Row:
@@ -90,46 +46,54 @@ def trial(options: CabinOptions, seed: int) -> Row:
     Raises CalibrationError where Open3D is missing or the cabin cannot be calibrated.
     """
     began = time.perf_counter()
-    cabin = draw_cabin(
-        np.random.default_rng([seed, 0]), options.hand_deg, 1e-3 * options.hand_mm
-    )
+    cabin = draw_cabin(np.random.default_rng([seed, 0]), options.hand_deg, options.hand_mm / 1e3)
     scene = taken(cabin, np.random.default_rng([seed, 1]), options.depth_noise)
     found = None
     if options.way != "none":
-        found = calibrate_cabin(
-            cabin, options.way, _shown(options), _carry(options), options.scale,
-            options.intrinsics == "factory", np.random.default_rng([seed, 2]),
-        )  # fmt: skip
+        found = calibrate_cabin(cabin, options, np.random.default_rng([seed, 2]))
     seconds = time.perf_counter() - began
-    model = measured_model(scene, used(cabin, found, options))
+    row = model_row(scene, used(cabin, found, options))
     return {
-        **of_calibration(cabin, found),
-        **of_model(model),
+        **row,
+        **({} if found is None else calibration_row(cabin, found)),
         "seconds_calibration": seconds,
         "seconds_model": time.perf_counter() - began - seconds,
     }
 
 
-def _shown(options: CabinOptions) -> Shown:
-    if options.way == "scan_board":
-        return Shown(0, options.added)
-    return Shown(options.alone, options.together)
-
-
-def _carry(options: CabinOptions) -> CarryOptions:
-    return CarryOptions(
-        frames=options.scan_frames,
-        points=POINTS_A_FEATURE * options.features,
-        max_points_per_image=options.features,
-        sigma_px=options.feature_px,
-    )
-
-
 def used(cabin: Cabin, found: Calibrated | None, options: CabinOptions) -> SimulatedRig:
-    """The rig that depth is made a model with."""
-    rigs = {"factory": cabin.nominal, "hand": cabin.nominal, "true": cabin.true}
+    """The rig by which depth becomes a model."""
+    rigs = {"factory": cabin.nominal, "hand": cabin.nominal, "exact": cabin.true}
     if found is not None:
         rigs["calibrated"] = found.rig
-    return SimulatedRig(
-        rigs[options.intrinsics].cameras, rigs[options.extrinsics].cam_from_rig
-    )
+    return SimulatedRig(rigs[options.intrinsics].cameras, rigs[options.extrinsics].cam_from_rig)
+
+
+def calibration_row(cabin: Cabin, found: Calibrated) -> Row:
+    """Errors of a calibration, rms over devices, and whether its sigmas hold."""
+    true, rig = cabin.true, found.rig
+    turn, shift = [], []
+    for side in cabin.infrared[1:]:
+        here, there = rig.cam_from_rig[side], true.cam_from_rig[side]
+        turn.append(np.degrees(angle_between(here.rotation, there.rotation)))
+        shift.append(here.inverse.translation - there.inverse.translation)
+    row: dict[str, float | int] = {
+        "turn_deg": rms(turn),
+        "shift_mm": 1e3 * rms(np.linalg.norm(shift, axis=1)),
+        "nees": found.nees,
+        "covered": float(np.mean(np.abs(found.z) < WITHIN_95)),
+        "parameters": len(found.names),
+    }
+    for kind, cameras in (("infrared", cabin.infrared), ("colour", cabin.colour)):
+        off = np.array([rig.cameras[i].params[:4] - true.cameras[i].params[:4] for i in cameras])
+        row[f"{kind}_focal_px"] = rms(off[:, 0])
+        row[f"{kind}_centre_px"] = rms(np.linalg.norm(off[:, 2:], axis=1))
+    return row
+
+
+def rms(values: Sequence[float] | FloatArray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+STUDY = Study(CabinOptions, trial, answer)

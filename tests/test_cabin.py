@@ -213,9 +213,7 @@ def test_tracks_agree_with_the_truth_and_join_devices_of_a_kind_alone() -> None:
 def test_a_feature_is_found_from_about_where_it_looks_alike() -> None:
     cabin, options = some_cabin(), CarryOptions(frames=40, points=400)
     rng = np.random.default_rng(1)
-    problem, truth = carry_box(
-        options, cabin.true, cabin.nominal, (cabin.infrared,), MIDDLE, rng
-    )
+    problem, truth = carry_box(options, cabin.true, cabin.nominal, (cabin.infrared,), MIDDLE, rng)
     seen = problem.observations
     directions = np.array([
         (truth.rig_from_world[f].inverse @ truth.cam_from_rig[c].inverse.translation)

@@ -46,11 +46,9 @@ def make_head(subdivisions: int = SUBDIVISIONS) -> tuple[FloatArray, IntArray]:
 
 
 def icosphere(subdivisions: int) -> tuple[FloatArray, IntArray]:
-    """Unit vectors (10 * 4^k + 2, 3) and triangles (20 * 4^k, 3) of an icosahedron, split k times."""
+    """Unit vectors (10 * 4^k + 2, 3) and triangles (20 * 4^k, 3): an icosahedron split k times."""
     golden = (1 + np.sqrt(5)) / 2
-    corners = [
-        (a * 1.0, b * golden, 0.0) for a in (-1, 1) for b in (-1, 1)
-    ]
+    corners = [(a * 1.0, b * golden, 0.0) for a in (-1, 1) for b in (-1, 1)]
     rolled = [np.roll(corner, shift) for shift in range(3) for corner in corners]
     vertices = np.array(rolled) / np.hypot(1, golden)
     gaps = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
@@ -74,7 +72,7 @@ def _split(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntAr
     edges, edge = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
     middle = vertices[edges].sum(axis=1)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    ab, bc, ca = (len(vertices) + edge.reshape(3, -1))
+    ab, bc, ca = len(vertices) + edge.reshape(3, -1)
     a, b, c = triangles.T
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     found: IntArray = np.concatenate([np.stack(part, axis=1) for part in parts])
