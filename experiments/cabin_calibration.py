@@ -40,7 +40,7 @@ CORNER_PX = 0.2  # noise of a corner
 TAPE_M = 0.005  # sigma of a tape between two housings, whose lenses' centres nobody sees
 # Cameras by index, infrared and colour of front, right and left. A device is shown the board on
 # its own, or together with the front one; right and left face each other.
-DEVICES = ((0, 1), (2, 3), (4, 5))
+DEVICES: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3), (4, 5))
 PAIRS = ((0, 1, 2, 3), (0, 1, 4, 5))
 FAR = (0, 4)  # the front and left infrared cameras, between which the tape is held
 ALONE = BoardViewOptions(distance_m=(0.45, 0.9), tilt_deg=(0.0, 45.0), least_seen=0.7)

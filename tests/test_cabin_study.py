@@ -143,7 +143,7 @@ def test_nothing_comes_of_nothing() -> None:
 
 def test_without_noise_the_true_rig_makes_the_head() -> None:
     row = trial(CabinOptions(**EXACT, depth_noise=0.0), 3)  # type: ignore[arg-type]
-    assert row["max_mm"] < 0.05 and row["registered_misplaced_mm"] < 20  # type: ignore[operator]
+    assert row["max_mm"] < 0.05 and row["registered_misplaced_mm"] < 5  # type: ignore[operator]
     assert row["misplaced_mm"] < 1e-9  # type: ignore[operator]
     painted = np.array(row["painted_mm"])
     assert 0.4 < np.mean(painted >= 0) < 0.9 and painted.max() < 0.05
@@ -156,7 +156,6 @@ def test_a_trial_depends_on_its_seed_alone_and_an_uncalibrated_cabin_is_worse() 
     exact = trial(CabinOptions(**EXACT), 1)  # type: ignore[arg-type]
     assert row["rms_mm"] > 2 * exact["rms_mm"]  # type: ignore[operator]
     assert row["colour_rms_mm"] > exact["colour_rms_mm"]  # type: ignore[operator]
-    assert trial(options, 2)["rms_mm"] != row["rms_mm"]
 
 
 def test_a_scan_calibrates_the_cabin_as_well_as_it_says() -> None:
