@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from graphs.frames import FloatArray, Transform
+from graphs.problem import IntArray
 from sfm_calib.depth.cloud import Cloud, normals_towards
 from sfm_calib.depth.registration import Registration, moved, register
 
-__all__ = ["Cloud", "Registration", "evenly_thinned", "fuse_clouds", "moved", "register"]
+__all__ = [
+    "Cloud", "Registration", "fuse_clouds", "moved", "oriented", "register", "thinned",
+]  # fmt: skip
 
 
 def fuse_clouds(
@@ -18,27 +22,34 @@ def fuse_clouds(
 ) -> Cloud:
     """One cloud in the rig's frame of parts (n, 3), each in m in its own camera's frame.
 
-    with_normals: by Open3D, of each part alone. Raises CalibrationError where that is missing.
+    with_normals: as `oriented`.
     """
-    rig_from_cam = [transform.inverse for transform in cam_from_rig]
-    placed = [at @ part for at, part in zip(rig_from_cam, parts, strict=True)]
+    placed = [t.inverse @ part for t, part in zip(cam_from_rig, parts, strict=True)]
     camera = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    normals = None
-    if with_normals:
-        normals = np.concatenate([
-            normals_towards(part, at.translation)
-            for part, at in zip(placed, rig_from_cam, strict=True)
-        ])  # fmt: skip
-    return Cloud(np.concatenate(placed), camera, normals)
+    cloud = Cloud(np.concatenate(placed), camera)
+    return oriented(cloud, cam_from_rig) if with_normals else cloud
 
 
-def evenly_thinned(cloud: Cloud, voxel_m: float) -> Cloud:
-    """One point of each camera in each cube of an edge: the one nearest to the cube's mean."""
-    cube = np.floor(cloud.points / voxel_m).astype(np.int64)
-    key = np.column_stack([cloud.camera, cube])
-    _, place, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+def oriented(cloud: Cloud, cam_from_rig: Sequence[Transform]) -> Cloud:
+    """With normals, by Open3D, of each camera's part alone, to that camera.
+
+    Raises CalibrationError where Open3D is missing.
+    """
+    normals = np.zeros_like(cloud.points)
+    for index, transform in enumerate(cam_from_rig):
+        rows = cloud.camera == index
+        if rows.any():
+            centre = transform.inverse.translation
+            normals[rows] = normals_towards(cloud.points[rows], centre)
+    return replace(cloud, normals=normals)
+
+
+def thinned(cloud: Cloud, voxel_m: float) -> IntArray:
+    """Rows of one point of each camera in each cube of an edge: the nearest to their mean."""
+    cubes = np.column_stack([cloud.camera, np.floor(cloud.points / voxel_m)]).astype(np.int64)
+    _, cube, count = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
     mean = np.zeros((len(count), 3))
-    np.add.at(mean, place, cloud.points)
-    off = np.linalg.norm(cloud.points - (mean / count[:, None])[place], axis=1)
-    order = np.lexsort((off, place))
-    return cloud.only(np.sort(order[np.r_[0, np.cumsum(count)[:-1]]]))
+    np.add.at(mean, cube, cloud.points)
+    off = np.linalg.norm(cloud.points - (mean / count[:, None])[cube], axis=1)
+    first = np.r_[0, np.cumsum(count)[:-1]].astype(np.int64)
+    return np.sort(np.lexsort((off, cube))[first])
