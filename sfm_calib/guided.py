@@ -84,9 +84,10 @@ def map_with_prior(
     found = features.load(place)
     scales = {i.path: f.scales for i, f in zip(scan.images, found, strict=True)}
     try:
-        coarse, messages = problem_of(
-            scan, config, lenses, models, models / DATABASE, lambda: scales
-        )
+        with cache.held(models):
+            coarse, messages = problem_of(
+                scan, config, lenses, models, models / DATABASE, lambda: scales
+            )
         _check_placed(coarse, scan)
         coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
     except CalibrationError as error:

@@ -71,14 +71,15 @@ def map_scan(
         [[*t.rotation.ravel().tolist(), *t.translation.tolist()] for t in nominal or ()],
         reference if nominal else None,
     ]
-    place = cache.stage(
-        "models",
-        inputs,
-        lambda place: run_apart(map_matched, (scan, config, nominal, database, place), progress),
-    )
-    problem, messages = problem_of(
-        scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
-    )
+    with cache.held(matches):
+        place = cache.stage(
+            "models",
+            inputs,
+            lambda to: run_apart(map_matched, (scan, config, nominal, database, to), progress),
+        )
+        problem, messages = problem_of(
+            scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
+        )
     return Mapped(problem, messages, hashes)
 
 
