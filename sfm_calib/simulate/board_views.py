@@ -36,6 +36,7 @@ from sfm_calib.target import graph_board, started_problem
 # As exact as its description says, so that an error is one of the corners in the image.
 PLAIN_BOARD = spec.Checkerboard(inner_corners=(9, 6), square_m=0.03, warp=False, corner_sigma_m=0.0)
 TRIES = 300  # for a place of the board that a frame's cameras see
+EXACT_PX = 1e-3  # sigma of corners without noise: weights are its inverse
 BACK_DEG = 85.0  # between line of sight and the board's normal: beyond it nothing is seen
 
 Range = tuple[float, float]
@@ -228,7 +229,7 @@ def corners_seen(
             corner = np.flatnonzero(inside & (rng.uniform(size=len(corners)) < seen))
             noise = sigma_px * rng.standard_normal((len(corner), 2))
             if len(corner) >= MIN_CORNERS:
-                sigmas = np.full(len(corner), sigma_px)
+                sigmas = np.full(len(corner), max(sigma_px, EXACT_PX))
                 views.append(BoardView(index, frame, corner, pixels[corner] + noise, sigmas))
     return tuple(views)
 
