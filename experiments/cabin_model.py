@@ -16,7 +16,7 @@ from graphs.frames import FloatArray, Transform
 from sfm_calib.depth.cloud import Cloud, depth_points
 from sfm_calib.depth.fuse import fuse_clouds, register
 from sfm_calib.depth.surface import Surface
-from sfm_calib.depth.surface_distance import Distances, summary
+from sfm_calib.depth.surface_distance import Distances, align_icp, summary
 from sfm_calib.errors import CalibrationError
 from sfm_calib.simulate.cabin import Cabin, head_place, resized
 from sfm_calib.simulate.depth_image import depth_image, to_be_seen
@@ -28,8 +28,7 @@ from sfm_calib.simulate.rigs import SimulatedRig
 COLOUR_SIZE = 1 / 3
 REGISTERED_BY = 2  # every other point tells ICP the same motion in half the time
 # A model is laid on the true head by so many of its points, none farther off it than this.
-MOST_LAID, LAID_ON_M = 4000, 0.05
-STEPS, SETTLED = 25, 1e-5  # at most so many, until none is larger, in rad and m
+MOST_LAID, LAID_ON_M = 2000, 0.05
 DECIMALS = 3  # of a painted distance in mm
 PAINTED = 4  # subdivisions of the head that distances are painted on: 2562 places
 FAILED_MM = 10.0  # parts of a model farther off than this, rms, were not registered
@@ -141,25 +140,10 @@ def misplaced_mm(cloud: Cloud, exact: Cloud) -> float:
 
 
 def laid_on_head(scene: Taken, points: FloatArray) -> FloatArray:
-    """Points (n, 3) in the rig's frame moved as one to where they fit the head best.
-
-    Point-to-plane ICP in a few steps: what is left of noise moves them by 0.01 mm for ever.
-    """
+    """Points (n, 3) in the rig's frame moved as one to where they fit the head best."""
     some = points[:: max(len(points) // MOST_LAID, 1)]
-    fit = scene.rig_from_head.inverse
-    for _ in range(STEPS):
-        at = fit @ some
-        place, normal = scene.head.closest(at)
-        off = np.einsum("ni,ni->n", at - place, normal)
-        near = np.linalg.norm(at - place, axis=1) < LAID_ON_M
-        middle = at.mean(axis=0)
-        rows = np.hstack([np.cross(at - middle, normal), normal])[near]
-        step = np.linalg.lstsq(rows, -off[near], rcond=None)[0]
-        turn = Transform.exp(step[:3], np.zeros(3)).rotation
-        fit = Transform(turn, middle + step[3:] - turn @ middle) @ fit
-        if np.abs(step).max() < SETTLED:
-            break
-    return fit @ points
+    fit = align_icp(some, scene.head, scene.rig_from_head.inverse, LAID_ON_M)
+    return fit.transform @ points
 
 
 def off_head(scene: Taken, on_head: FloatArray) -> Distances:

@@ -16,7 +16,7 @@ from graphs.camera import Camera, project, unproject
 from graphs.frames import FloatArray, Transform
 from graphs.problem import IntArray
 from sfm_calib.errors import CalibrationError
-from sfm_calib.simulate.room import import_open3d
+from sfm_calib.open3d_import import import_open3d
 
 STEEPEST_DEG = 80.0  # between a ray and the surface's normal: from beyond too little light returns
 BORDER_PX = 2  # about a surface's vertices, between which it may bulge
@@ -32,7 +32,7 @@ class Seen:
 
 def to_be_seen(vertices: FloatArray, triangles: IntArray) -> Seen:
     """A surface as rays find it. Raises CalibrationError without Open3D."""
-    open3d = import_open3d()
+    open3d = import_open3d("simulating depth images")
     scene = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor
     scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
