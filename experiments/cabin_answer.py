@@ -10,6 +10,7 @@ from experiments.cabin_cases import (
     ADDED,
     BOARDS,
     FACTORY,
+    FEWEST,
     LOOSE,
     NOTHING,
     SCAN,
@@ -20,6 +21,7 @@ from experiments.cabin_cases import (
     cell,
     is_lost,
     is_refused,
+    is_swept,
     mean,
     number,
     paired,
@@ -86,7 +88,7 @@ def fails_by_hand(cases: Cases) -> tuple[str, bool | None]:
     trials = cases[NOTHING]
     failed = sum(is_lost(one) for one in trials)
     words = f"from places by hand {failed} of {len(trials)} heads fail to register"
-    if len(trials) < 2:
+    if len(trials) < FEWEST:
         return words, None
     share = failed / len(trials)
     chance = (OFTEN * (1 - OFTEN) / len(trials)) ** 0.5
@@ -179,6 +181,7 @@ def device_table(cases: Cases) -> AnswerTable:
     rows = [
         (name, *(cell(mean(trials, column)[0]) for column in columns))
         for name, trials in cases.items()
+        if not is_swept(trials)
     ]
     return AnswerTable(
         "devices",

@@ -13,6 +13,7 @@ from experiments.runner.protocol import Finished
 Trials = Sequence[Finished[CabinOptions]]
 Cases = Mapping[str, Trials]  # finished ones, by what is said of the case
 
+FEWEST = 4  # cabins from which anything is concluded
 NOTHING, FACTORY, BOARDS = "nothing", "places by boards, factory lenses", "boards"
 SCAN, LOOSE, ADDED, TRUTH = "scan, tape", "scan, no length", "scan + one board", "truth"
 
@@ -43,6 +44,12 @@ def by_case(trials: Trials) -> Cases:
     return {name: [one for one in trials if case_of(one.options) == name] for name in names}
 
 
+def is_swept(trials: Trials) -> bool:
+    """Whether a case is one of those with exact lenses and places by hand."""
+    options = trials[0].options
+    return (options.way, options.intrinsics, options.extrinsics) == ("none", "exact", "hand")
+
+
 def is_lost(trial: Finished[CabinOptions]) -> bool:
     """Whether ICP left a part of the model where it does not belong."""
     return number(trial, "registered_misplaced_mm") > FAILED_MM
@@ -69,11 +76,11 @@ def mean(trials: Trials, column: str) -> tuple[float, float]:
 
 
 def paired(trials: Trials, others: Trials, column: str) -> tuple[float, float]:
-    """Mean of the differences on the same cabins and its standard error, infinite of one."""
+    """Mean of the differences on the same cabins and its standard error, infinite of too few."""
     there = {one.seed: number(one, column) for one in others}
     less = np.array([number(one, column) - there[one.seed] for one in trials if one.seed in there])
     less = less[np.isfinite(less)]
-    if len(less) < 2:
+    if len(less) < FEWEST:
         return float(less.mean()) if len(less) else float("nan"), float("inf")
     return float(less.mean()), float(less.std(ddof=1) / len(less) ** 0.5)
 

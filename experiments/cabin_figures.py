@@ -18,6 +18,7 @@ from experiments.cabin_cases import (
     Cases,
     Trials,
     is_lost,
+    is_swept,
     mean,
     number,
     share,
@@ -76,6 +77,7 @@ def figures(cases: Cases) -> tuple[AnswerFigure, ...]:
 def rms_figure(cases: Cases) -> go.Figure:
     """A pair of bars a case."""
     figure = go.Figure()
+    cases = {name: trials for name, trials in cases.items() if not is_swept(trials)}
     for index, (what, column) in enumerate(
         (("as placed", "rms_mm"), ("after ICP between the parts", "registered_rms_mm"))
     ):
@@ -89,6 +91,7 @@ def rms_figure(cases: Cases) -> go.Figure:
         )
     figure.add_hline(y=PUBLISHED_FUSED[1], line={"color": MUTED, "dash": "dot"})
     styled(figure, 460)
+    figure.update_xaxes(automargin=True)
     figure.update_yaxes(title="RMS distance, mm")
     figure.update_layout(showlegend=True, barmode="group")
     return figure
@@ -96,12 +99,7 @@ def rms_figure(cases: Cases) -> go.Figure:
 
 def by_hand(cases: Cases) -> list[tuple[CabinOptions, Trials]]:
     """Cases of exact lenses and places by hand, by how far these are off."""
-    found = [
-        (trials[0].options, trials)
-        for trials in cases.values()
-        if (trials[0].options.way, trials[0].options.intrinsics) == ("none", "exact")
-        and trials[0].options.extrinsics == "hand"
-    ]
+    found = [(trials[0].options, trials) for trials in cases.values() if is_swept(trials)]
     return sorted(found, key=lambda one: (one[0].hand_deg, one[0].hand_mm))
 
 

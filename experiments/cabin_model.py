@@ -29,7 +29,7 @@ COLOUR_SIZE = 1 / 3
 REGISTERED_BY = 2  # every other point tells ICP the same motion in half the time
 # A model is laid on the true head by so many of its points, none farther off it than this.
 MOST_LAID, LAID_ON_M = 2000, 0.05
-DECIMALS = 3  # of a painted distance in mm
+DECIMALS = 4  # of mm: less is rounding
 PAINTED = 4  # subdivisions of the head that distances are painted on: 2562 places
 FAILED_MM = 10.0  # parts of a model farther off than this, rms, were not registered
 
@@ -131,9 +131,10 @@ def misplaced_mm(cloud: Cloud, exact: Cloud) -> float:
     turn, _ = Rotation.align_vectors(exact.points[front] - there, cloud.points[front] - middle)
     off = turn.apply(cloud.points - middle) + there - exact.points
     square = (off**2).sum(axis=1)
-    return 1e3 * max(
+    worst_m = max(
         float(np.sqrt(square[cloud.camera == camera].mean())) for camera in np.unique(cloud.camera)
     )
+    return round(1e3 * worst_m, DECIMALS)
 
 
 # ---- distances to the true head ------------------------------------------------------------

@@ -93,7 +93,7 @@ def test_what_does_not_hold_turns_the_verdict(case: str, numbers: tuple[float, f
     assert not result.verdict.startswith("yes")
 
 
-@pytest.mark.parametrize("seeds", [0, 1])
+@pytest.mark.parametrize("seeds", [0, 1, 3])
 def test_too_few_trials_say_nothing(seeds: int) -> None:
     assert answer(made_up(seeds)).holds is None
 
@@ -150,12 +150,12 @@ def test_without_noise_the_true_rig_makes_the_head() -> None:
 
 
 def test_a_trial_depends_on_its_seed_alone_and_an_uncalibrated_cabin_is_worse() -> None:
-    options = CabinOptions(**UNCALIBRATED)  # type: ignore[arg-type]
-    row = trial(options, 1)
-    assert untimed(row) == untimed(trial(options, 1))
-    exact = trial(CabinOptions(**EXACT), 1)  # type: ignore[arg-type]
-    assert row["rms_mm"] > 2 * exact["rms_mm"]  # type: ignore[operator]
-    assert row["colour_rms_mm"] > exact["colour_rms_mm"]  # type: ignore[operator]
+    exact = CabinOptions(**EXACT)  # type: ignore[arg-type]
+    row = trial(exact, 1)
+    assert untimed(row) == untimed(trial(exact, 1))
+    worse = trial(CabinOptions(**UNCALIBRATED), 1)  # type: ignore[arg-type]
+    assert worse["rms_mm"] > 2 * row["rms_mm"]  # type: ignore[operator]
+    assert worse["colour_rms_mm"] > row["colour_rms_mm"]  # type: ignore[operator]
 
 
 def test_a_scan_calibrates_the_cabin_as_well_as_it_says() -> None:
@@ -235,7 +235,7 @@ def test_a_device_that_is_shifted_shows_in_the_model() -> None:
     places = list(cabin.true.cam_from_rig)
     places[2] = Transform(np.eye(3), np.array([0.0, 0.0, 0.01])) @ places[2]
     row = model_row(scene, SimulatedRig(cabin.true.cameras, tuple(places)))
-    assert row["misplaced_mm"] == pytest.approx(10.0, rel=1e-6)
+    assert row["misplaced_mm"] == pytest.approx(10.0, abs=1e-3)
     assert 1.0 < row["mean_mm"] < 10.0  # type: ignore[operator]
     assert row["infrared_rms_mm"] < 0.05  # type: ignore[operator]
 
