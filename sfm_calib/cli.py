@@ -45,6 +45,7 @@ from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.convert_command import Convert, run_convert
 from sfm_calib.depth.distance_command import SurfaceDistance, run_surface_distance
+from sfm_calib.depth.fuse_command import Fuse, run_fuse
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 from sfm_calib.history_command import HistoryCommand, run_history
@@ -87,6 +88,7 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[Check, tyro.conf.subcommand("check", default=check_default)]
         | Annotated[Undistort, tyro.conf.subcommand("undistort")]
         | Annotated[Rectify, tyro.conf.subcommand("rectify")]
+        | Annotated[Fuse, tyro.conf.subcommand("fuse")]
         | Annotated[SurfaceDistance, tyro.conf.subcommand("surface-distance")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
@@ -185,6 +187,9 @@ def run(command: Command, arguments: Sequence[str]) -> int:
     elif isinstance(command, Rectify):
         with output_folder(command.out):
             run_rectify(command, told(arguments))
+    elif isinstance(command, Fuse):
+        with output_folder(command.out):
+            run_fuse(command, told(arguments))
     elif isinstance(command, SurfaceDistance):
         run_surface_distance(command, arguments)
     elif isinstance(command, Simulate):

@@ -18,11 +18,12 @@ from graphs.camera import Camera, project, unproject
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import LensName
 from sfm_calib.errors import CalibrationError
+from sfm_calib.open3d_import import import_open3d
 from sfm_calib.result import load_calibration, save_calibration
 from sfm_calib.simulate import render as rendering
 from sfm_calib.simulate.render import RenderOptions, ray_table, render
 from sfm_calib.simulate.rigs import CAMERA_COUNT, TrajectoryName, make_rig, make_trajectory
-from sfm_calib.simulate.room import Room, build_room, import_open3d
+from sfm_calib.simulate.room import Room, build_room
 from sfm_calib.simulate.scan import SimulateOptions, rig_like, simulate_scan
 from sfm_calib.simulate.textures import pink_noise
 

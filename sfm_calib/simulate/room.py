@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from graphs.frames import FloatArray, Transform, exp_rotation
-from sfm_calib.errors import CalibrationError
+from sfm_calib.open3d_import import import_open3d
 from sfm_calib.simulate.textures import (
     Float32,
     Grey,
@@ -39,10 +38,6 @@ LIGHTS: tuple[tuple[tuple[float, float, float], float], ...] = (  # position, st
 AMBIENT = 0.6
 BOARD_PLACE = Transform(  # upright before the wall at y = 2.5, facing the room
     np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.array([-0.27, 2.2, 1.75])
-)
-OPEN3D_REMEDY = (
-    "needs open3d: pip install 'sfm_calib[depth]'; "
-    "on Debian/Ubuntu also apt-get install libusb-1.0-0 libgl1 libgomp1"
 )
 
 
@@ -123,18 +118,6 @@ def build_room(
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(vertices, triangles)
     return Room(mesh, pack(pictures), hung, scene)
-
-
-def import_open3d() -> Any:
-    """The open3d module. Raises CalibrationError when it, or a library it needs, is missing."""
-    # Numba chooses its threads now: Open3D loads a TBB too old for it, and numba would say so.
-    numba.get_num_threads()
-    try:
-        import open3d
-    except (ImportError, OSError) as error:  # OSError: a system library is missing
-        cause = str(error).splitlines()[0]
-        raise CalibrationError(f"simulating images {OPEN3D_REMEDY} ({cause})") from error
-    return open3d
 
 
 def _sheet(
