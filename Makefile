@@ -12,7 +12,7 @@ DEVLOCK := requirements/dev.lock
 UV      := uv==0.13.9
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all check bench venv learned lock clean
+.PHONY: help demo test test-all check bench study venv learned lock clean
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -24,11 +24,11 @@ demo: $(STAMP) ## simulate a three-camera scan, calibrate it, compare with the t
 
 test: $(STAMP) ## the tests that take seconds
 	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; the tests that need Open3D are skipped"
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4
 
 test-all: $(STAMP) ## all tests, the slow ones included
 	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; the tests that need Open3D are skipped"
-	@$(BIN)/python -m pytest -q -m ""
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "" --hypothesis-profile default
 
 check: $(STAMP) ## formatting, lint and types
 	@status=0; for tool in "ruff format --check ." "ruff check ." mypy; do \
@@ -36,6 +36,13 @@ check: $(STAMP) ## formatting, lint and types
 
 bench: $(STAMP) ## run the benchmarks (out/bench; ARGS=--quick for the small ones)
 	@$(BIN)/python -m experiments.bench $(ARGS)
+
+study: $(STAMP) ## run a study and draw its answer: make study STUDY=coverage [ARGS="--set seeds=5"]
+	@test -f "configs/studies/$(STUDY).yaml" || { \
+	  echo "make: say which study: STUDY=" $$(ls configs/studies | sed 's/\.yaml$$//') >&2; exit 2; }
+	@sh scripts/system_packages.sh $(VENV) || echo "make: going on; only the cabin needs Open3D"
+	@$(BIN)/sfm-calib run configs/studies/$(STUDY).yaml -o out/$(STUDY) $(ARGS)
+	@$(BIN)/sfm-calib study out/$(STUDY)
 
 venv: $(STAMP) ## only set up .venv
 

@@ -37,9 +37,10 @@ from graphs.model_covariance import calibration_columns
 from graphs.priors import LensPrior, weak_lens_prior
 from graphs.problem import Estimate, Problem
 from graphs.refine import Refinement, refine
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.stated_covariance import calibration_covariance
 from graphs.system import assemble
+from graphs.threads import threads
 from sfm_calib.files import write_atomically
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 

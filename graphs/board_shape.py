@@ -12,8 +12,8 @@ from graphs.influence import responses
 from graphs.keys import shape_key
 from graphs.noise import loss_moments
 from graphs.problem import Estimate, residuals_px
-from graphs.solve import threads
 from graphs.system import assemble, jacobian_of
+from graphs.threads import threads
 
 
 def shape_sigmas(

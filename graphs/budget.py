@@ -24,8 +24,8 @@ from graphs.influence import influences, responses
 from graphs.model_covariance import calibration_columns
 from graphs.problem import IntArray, KnownSpan, Problem
 from graphs.selection import compact
-from graphs.solve import threads
 from graphs.system import assemble
+from graphs.threads import threads
 
 GRID = 8  # cells a side over which an image's observations are spread
 

@@ -21,8 +21,8 @@ from graphs.influence import responses
 from graphs.keys import lens_key, rig_key
 from graphs.noise import LossMoments, loss_moments
 from graphs.problem import Estimate, IntArray, Problem, residuals_px
-from graphs.solve import threads
 from graphs.system import assemble, jacobian_of
+from graphs.threads import threads
 from graphs.unit import baseline_unit, unit_jacobian
 
 

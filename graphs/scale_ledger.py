@@ -27,8 +27,8 @@ from graphs.influence import responses
 from graphs.noise import loss_moments
 from graphs.problem import Estimate, ScaleSource, residuals_px
 from graphs.scale import length_of, scale_factor, total_sigma_m
-from graphs.solve import threads
 from graphs.system import assemble, jacobian_of
+from graphs.threads import threads
 
 # Of sources that agree, one in 370 is as far off; with as many as ten, one scan in 37.
 CONTRADICTION = 3.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from graphs.frames import FloatArray, Transform, from_gtsam_inverse
 from graphs.keys import board_key, frame_key, lens_key, rig_key, shape_key
 from graphs.problem import Estimate
 from graphs.system import System, assemble
+from graphs.threads import threads
 from graphs.tracks import TRIANGULATION_TOLERANCE, Variables, triangulate
 
 # With n observations no parameter is more than sqrt(2e-9 n) of its sigma from the optimum: 0.01 of
@@ -55,11 +55,6 @@ class State:
     variables: Variables
     points: FloatArray  # (n_points, 4) as `graphs.clusters.homogeneous` has them
     cost: float
-
-
-def threads() -> ThreadPoolExecutor:
-    """A thread for each core that this process may use."""
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)))
 
 
 def solve(

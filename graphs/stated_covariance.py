@@ -31,7 +31,7 @@ from graphs.jackknife import Jackknife, delete_group_jackknife
 from graphs.model_covariance import ModelCovariance, model_covariance
 from graphs.problem import Estimate
 from graphs.shrinkage import shrunk
-from graphs.solve import threads
+from graphs.threads import threads
 
 MIN_FRAMES = 5  # fewer cannot show how much frames differ
 MIN_CLUSTERS = 5  # of tracks, and of corners

@@ -24,6 +24,7 @@ MOST_CONDITION = 1e13  # of a point's normal equations: rays parallel to 1e-6 ra
 ON_PARALLEL_RAYS = 1e-13  # information that keeps the start finite there
 ITERATIONS = 50
 CONVERGED_PX = 1e-10
+ROUNDING = 1e-11  # of the cost: residuals of a tenth of a px at pixels in the thousands
 FIRST_DAMPING, LEAST_DAMPING = 1e-6, 1e-12
 
 
@@ -153,7 +154,7 @@ def triangulate(
     for _ in range(ITERATIONS):
         damped = normal + damping[:, None, None] * np.eye(3) * normal
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-        if (-(step * gradient).sum(-1) <= CONVERGED_PX**2).all():
+        if (-(step * gradient).sum(-1) <= CONVERGED_PX**2 + ROUNDING * cost).all():
             break
         tried = _normal_equations(estimate, cameras, points + step, wanted, weight)
         better = tried[0] <= cost  # not so where it is NaN

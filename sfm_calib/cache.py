@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,14 +16,20 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
 
 DISK_IS_FULL = 1_000_000  # bytes free
+KEY_IN_NAME = 16  # hex digits
 
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder beside the result. `fresh` ignores what earlier runs left."""
+    """A folder beside the result. `fresh` ignores what earlier runs left.
+
+    shared: runs that go on at once use it together. A stage is then kept for each of its inputs,
+    never made twice, and what one run makes the others wait for; `fresh` is not for it.
+    """
 
     folder: Path
     fresh: bool = False
+    shared: bool = False
 
     def stage(self, name: str, inputs: object, make: Callable[[Path], None]) -> Path:
         """The stage's folder, filled by `make(folder)` unless `inputs` are those of last time.
@@ -30,10 +38,33 @@ class Cache:
         that fails is removed, because it may be what fills the disk.
         Raises CalibrationError when the disk is full.
         """
-        place, key_file = self.folder / name, self.folder / f"{name}.key"
         key = key_of(inputs)
+        place = self.folder / (f"{name}.{key[:KEY_IN_NAME]}" if self.shared else name)
+        with self.held(place):
+            self._fill(place, key, make)
+        return place
+
+    @contextmanager
+    def held(self, place: Path) -> Iterator[None]:
+        """A stage of a shared cache for this run alone: COLMAP aborts where two open a database.
+
+        The lock goes with the process that has it.
+        """
+        if not self.shared:
+            yield
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(_beside(place, "lock"), os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(lock)
+
+    def _fill(self, place: Path, key: str, make: Callable[[Path], None]) -> None:
+        key_file = _beside(place, "key")
         if not self.fresh and _text(key_file) == key + _sizes(place):
-            return place
+            return
         try:
             key_file.unlink(missing_ok=True)
             shutil.rmtree(place, ignore_errors=True)
@@ -48,13 +79,16 @@ class Cache:
             raise CalibrationError(
                 f"cannot write {place}: {reason}; free some space or choose another output folder"
             ) from error
-        return place
 
     def _drop(self, place: Path) -> None:
         """Remove an unfinished stage, and the cache's folder where nothing else is in it."""
         shutil.rmtree(place, ignore_errors=True)
         with suppress(OSError):
             self.folder.rmdir()
+
+
+def _beside(place: Path, what: str) -> Path:
+    return place.with_name(f"{place.name}.{what}")
 
 
 def _sizes(place: Path) -> str:

@@ -9,6 +9,8 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,6 +43,7 @@ from sfm_calib.compare_command import Compare, run_compare
 from sfm_calib.comparison import check_same_cameras, compare_with_truth
 from sfm_calib.config import RIG_FILE, RigConfig, first_problem, load_rig_config
 from sfm_calib.convert_command import Convert, run_convert
+from sfm_calib.depth.distance_command import SurfaceDistance, run_surface_distance
 from sfm_calib.depth.fuse_command import Fuse, run_fuse
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
@@ -56,6 +59,9 @@ from sfm_calib.terminal import progress_bars, result_console
 from sfm_calib.undistort_command import Rectify, Undistort, run_rectify, run_undistort
 
 EXIT_BAD_INPUT = 2
+# Packages above this one, such as experiments, bring commands of their own under this name: frozen
+# dataclasses with run(arguments) -> exit code.
+ENTRY_POINTS = "sfm_calib.commands"
 DEMO_FRAMES = 24
 DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the same result
 EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
@@ -83,10 +89,13 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         | Annotated[Undistort, tyro.conf.subcommand("undistort")]
         | Annotated[Rectify, tyro.conf.subcommand("rectify")]
         | Annotated[Fuse, tyro.conf.subcommand("fuse")]
+        | Annotated[SurfaceDistance, tyro.conf.subcommand("surface-distance")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[SimulateTracks, tyro.conf.subcommand("simulate-tracks")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
     )
+    for name, brought in brought_commands().items():
+        commands = commands | Annotated[brought, tyro.conf.subcommand(name)]
     command: Command = tyro.cli(
         commands,
         prog="sfm-calib",
@@ -95,6 +104,12 @@ def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     return command
+
+
+@cache
+def brought_commands() -> dict[str, Any]:
+    """Commands of packages above this one, by name."""
+    return {point.name: point.load() for point in entry_points(group=ENTRY_POINTS)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -145,6 +160,9 @@ def quiet_decoders() -> None:
 
 def run(command: Command, arguments: Sequence[str]) -> int:
     """Do what a parsed command asks for; the exit code."""
+    if isinstance(command, tuple(brought_commands().values())):
+        brought: Any = command
+        return int(brought.run(arguments))
     if isinstance(command, Recalibrate):
         return run_recalibrate(command, config_of(command.scan, arguments), arguments)
     if isinstance(command, Calibrate):
@@ -172,6 +190,8 @@ def run(command: Command, arguments: Sequence[str]) -> int:
     elif isinstance(command, Fuse):
         with output_folder(command.out):
             run_fuse(command, told(arguments))
+    elif isinstance(command, SurfaceDistance):
+        run_surface_distance(command, arguments)
     elif isinstance(command, Simulate):
         with progress_bars() as progress:
             simulate_scan(command.options, command.out, progress, command.overwrite)

@@ -12,6 +12,7 @@ from sfm_calib.boards.page import BoardPrint
 from sfm_calib.compare_command import Compare
 from sfm_calib.config import Options, TargetOptions
 from sfm_calib.convert_command import Convert
+from sfm_calib.depth.distance_command import SurfaceDistance
 from sfm_calib.depth.fuse_command import Fuse
 from sfm_calib.formats.convert import FormatName
 from sfm_calib.history_command import HistoryCommand
@@ -152,5 +153,5 @@ class BoardCommand:
 
 Command = (
     Calibrate | Recalibrate | Target | Compare | HistoryCommand | Convert | BoardCommand | Check
-    | Undistort | Rectify | Fuse | Simulate | SimulateTracks | Demo
+    | Undistort | Rectify | Fuse | SurfaceDistance | Simulate | SimulateTracks | Demo
 )  # fmt: skip

@@ -308,7 +308,7 @@ def first_problem(
         return f"{where}: takes a list, like [a, b] (got {value!r})"
     message = problem["msg"].removeprefix("Value error, ")
     shown = f" (got {value!r})" if isinstance(value, str | int | float | bool) else ""
-    return f"{where}: {message}{shown}"
+    return f"{where}: {message}{shown}" if where else message
 
 
 def _valid_names(location: tuple[str | int, ...]) -> list[str]:

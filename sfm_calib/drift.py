@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from graphs.compare import Stated
-from graphs.covariance import Covariance
+from graphs.covariance import NOTHING, Covariance
 from graphs.drift import Drift, Verdict, drift
 from graphs.drift_picture import Group, assumed_covariance
 from graphs.drift_tests import Criteria, GroupDrift
@@ -25,7 +25,6 @@ EXIT_STATUS: dict[Verdict, int] = {"keep": 0, "replace": 3, "inconclusive": 4}
 Unit = Literal["m", "baseline"]
 # Two metres before a rig whose cameras sit 5 cm to half a metre apart.
 RANGE: dict[Unit, float] = {"m": Criteria.range, "baseline": 10.0}
-EXACT = Covariance((), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def judge(
     options = options or DriftOptions()
     assumed = not old.covariance.names and cov_difference is None
     if assumed:
-        in_first = rereferenced(old.estimate, EXACT, 0)[0]
+        in_first = rereferenced(old.estimate, NOTHING, 0)[0]
         covariance = assumed_covariance(in_first, options.old_sigma_px, options.range(unit))
         old = Stated(in_first, covariance)
     found = drift(
@@ -122,21 +121,26 @@ def judge(
         said.append(f"the two have no metric scale in common: {size} is not judged")
     record = _record(found, unit, options.old_sigma_px if assumed else None, tuple(said))
     of_old = (
-        found.verdict == "inconclusive" and not cov_difference and _of_old(found, tested, n_frames)
+        found.verdict == "inconclusive"
+        and not cov_difference
+        and _of_old(found, tested, n_frames, leaning)
     )
     lines = tuple(verdict_lines(record, of_old))
     return Judged(record.model_copy(update={"lines": lines}), found)
 
 
 def _of_old(
-    found: Drift, tested: Collection[tuple[str, Group]] | None, n_frames: int | None
+    found: Drift,
+    tested: Collection[tuple[str, Group]] | None,
+    n_frames: int | None,
+    leaning: Mapping[tuple[str, Group], float] | None,
 ) -> bool:
     """Whether this scan would do, were the old calibration exact."""
-    exact = Stated(found.old.estimate, EXACT)
+    exact = Stated(found.old.estimate, NOTHING)
     criteria = replace(found.criteria, depth_ranges=())
     return not drift(
         exact, found.new, criteria,
-        scale_free=found.scale_free, tested=tested, n_frames=n_frames,
+        scale_free=found.scale_free, tested=tested, n_frames=n_frames, leaning=leaning,
     ).unresolved  # fmt: skip
 
 

@@ -25,7 +25,6 @@ from sfm_calib import colmap, features
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.files import sha256
 from sfm_calib.fine_tracks import fine_problem
 from sfm_calib.formats.reading import CameraRig
 from sfm_calib.images import Progress, Scan
@@ -65,7 +64,7 @@ def map_with_prior(
         known[i].lens if i in known else lens_of(config, name, len(scan.cameras))
         for i, name in enumerate(scan.cameras)
     ]
-    hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
+    hashes = scan.hashes
     inputs: list[object] = [hashes, scan.cameras, config.max_features, cv2.__version__]
     place = cache.stage(
         "guided_features",
@@ -85,9 +84,10 @@ def map_with_prior(
     found = features.load(place)
     scales = {i.path: f.scales for i, f in zip(scan.images, found, strict=True)}
     try:
-        coarse, messages = problem_of(
-            scan, config, lenses, models, models / DATABASE, lambda: scales
-        )
+        with cache.held(models):
+            coarse, messages = problem_of(
+                scan, config, lenses, models, models / DATABASE, lambda: scales
+            )
         _check_placed(coarse, scan)
         coarse = _in_unit_of(_solved(coarse, config, progress), nominal)
     except CalibrationError as error:

@@ -58,6 +58,11 @@ class Scan:
         """How messages call an image."""
         return f"{self.cameras[image.camera]}/{self.frames[image.frame]}"
 
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every image, by its path."""
+        return {image.path: sha256(self.root / image.path) for image in self.images}
+
 
 def read_scan(
     scan: Path,

@@ -17,7 +17,6 @@ from sfm_calib import colmap
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
-from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping_attempts import attempts
 from sfm_calib.nominal import nominal_rig
@@ -50,7 +49,7 @@ def map_scan(
 
     Raises CalibrationError when images do not overlap, or a camera cannot be placed.
     """
-    hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
+    hashes = scan.hashes
     inputs: list[object] = [
         hashes, scan.cameras, lenses, config.max_features,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
@@ -72,14 +71,15 @@ def map_scan(
         [[*t.rotation.ravel().tolist(), *t.translation.tolist()] for t in nominal or ()],
         reference if nominal else None,
     ]
-    place = cache.stage(
-        "models",
-        inputs,
-        lambda place: run_apart(map_matched, (scan, config, nominal, database, place), progress),
-    )
-    problem, messages = problem_of(
-        scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
-    )
+    with cache.held(matches):
+        place = cache.stage(
+            "models",
+            inputs,
+            lambda to: run_apart(map_matched, (scan, config, nominal, database, to), progress),
+        )
+        problem, messages = problem_of(
+            scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
+        )
     return Mapped(problem, messages, hashes)
 
 

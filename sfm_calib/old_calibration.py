@@ -10,10 +10,11 @@ import numpy as np
 
 from graphs.compare import Stated
 from graphs.compare_rig import pair_place
+from graphs.covariance import NOTHING
 from graphs.drift_picture import assumed_covariance
 from sfm_calib.compare_sides import renamed
 from sfm_calib.config import BaselineConfig, RigConfig
-from sfm_calib.drift import EXACT, DriftOptions
+from sfm_calib.drift import DriftOptions
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.formats import NO_SIZE, CameraRig
 from sfm_calib.images import Scan
@@ -43,7 +44,7 @@ class OldCalibration:
     @property
     def own(self) -> Stated:
         """With what it states itself: nothing, where its sigmas are assumed."""
-        return Stated(self.stated.estimate, EXACT) if self.assumed else self.stated
+        return Stated(self.stated.estimate, NOTHING) if self.assumed else self.stated
 
     def common(self, names: Sequence[str]) -> tuple[str, ...]:
         """Of these cameras, those that it has."""

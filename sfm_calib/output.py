@@ -75,9 +75,8 @@ def finish(
 
     Raises CalibrationError at the end, where a format refused.
     """
-    provenance = outcome.calibration.provenance.model_copy(update={"created": now()})
-    calibration = outcome.calibration.model_copy(update={"provenance": provenance})
-    outcome = replace(outcome, calibration=calibration)
+    outcome = dated(outcome)
+    calibration = outcome.calibration
     write_results(outcome, out, rows)
     console = result_console()
     if as_json:
@@ -92,6 +91,13 @@ def finish(
         print_line(console, line)
     if refused:
         raise CalibrationError("; ".join(refused) + f" ({out / 'calibration.json'} is written)")
+
+
+def dated(outcome: Outcome) -> Outcome:
+    """With the moment of writing in its provenance."""
+    provenance = outcome.calibration.provenance.model_copy(update={"created": now()})
+    calibration = outcome.calibration.model_copy(update={"provenance": provenance})
+    return replace(outcome, calibration=calibration)
 
 
 def write_results(outcome: Outcome, out: Path, rows: Sequence[TruthRow]) -> None:

@@ -290,15 +290,10 @@ def completed(
 
 def _rig(calibration: result.Calibration, found: Completed) -> result.RigResult:
     estimate, sigma = found.stated.estimate, found.stated.covariance.sigma
-    placed = {}
-    for camera, transform in zip(estimate.cameras, estimate.cam_from_rig, strict=True):
-        x, y, z, *move = (sigma.get(name, 0.0) for name in pose_names(camera.name))
-        placed[camera.name] = result.CamFromRig(
-            rotation_wxyz=tuple(transform.rotation_wxyz.tolist()),
-            translation=tuple(transform.translation.tolist()),
-            sigma_rotation_deg=tuple(np.degrees([x, y, z]).tolist()),
-            sigma_translation=tuple(move),
-        )
+    placed = {
+        camera.name: result.CamFromRig.of(camera.name, transform, sigma)
+        for camera, transform in zip(estimate.cameras, estimate.cam_from_rig, strict=True)
+    }
     return result.RigResult(
         reference=found.reference,
         cam_from_rig=placed,

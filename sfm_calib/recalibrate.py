@@ -7,7 +7,7 @@ old one is to be believed (`prior: full`), the graph is solved once more with it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -47,7 +47,8 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
 from sfm_calib.guided import map_with_prior
-from sfm_calib.images import Progress
+from sfm_calib.images import Progress, Scan
+from sfm_calib.mapping import Mapped
 from sfm_calib.nominal import check_config, start_from_config
 from sfm_calib.old_calibration import OldCalibration, old_calibration, with_scale_of
 from sfm_calib.partial import completed
@@ -120,17 +121,43 @@ def recalibrate(
     drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the
     two have no camera in common.
     """
-    watch, replaces = Stopwatch(), _replaced(read)
+    watch = Stopwatch()
+    scan = checked_scan(scan_path, config, cache, progress, watch)
+
+    def mapping(old: CameraRig, config: RigConfig) -> Mapped:
+        return map_with_prior(scan, old, config, cache, progress)
+
+    return recalibrate_scan(
+        read, scan, mapping, config, options, drift, progress, command, watch
+    )  # fmt: skip
+
+
+def recalibrate_scan(
+    read: CameraRig,
+    scan: Scan,
+    mapping: Callable[[CameraRig, RigConfig], Mapped],
+    config: RigConfig,
+    options: RecalibrateOptions,
+    drift: DriftOptions,
+    progress: Progress,
+    command: str,
+    watch: Stopwatch,
+) -> Recalibrated:
+    """As `recalibrate`, of a scan that was read, or was never on disk.
+
+    mapping: its tracks and rough places, given the old calibration in the scan's terms and a
+    configuration with its lenses.
+    """
+    replaces = _replaced(read)
     if options.metres is not None:
         read = read.metric(options.metres)
-    scan = checked_scan(scan_path, config, cache, progress, watch)
     old = old_calibration(read, scan, config, options.cameras, drift)
     config = _with_reference(with_lenses(config, old.rig, scan.cameras), old, scan.cameras)
     check_config(config, scan)
     # What it refuses (a wrong word of --free) is refused before the minutes that mapping takes.
     _prior_of(old, "start", options.free, scan.cameras, config)
     with watch.stage("tracks and mapping"):
-        mapped = map_with_prior(scan, old.rig, config, cache, progress)
+        mapped = mapping(old.rig, config)
     given = Given(scan, config, mapped, command)
     with enough_placed(mapped.problem, len(scan.images)):
         judged = _judged(given, old, options, drift, watch, progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Literal
 
@@ -12,6 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from graphs.camera import Camera
 from graphs.frames import Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
+from graphs.propagation import pose_names
 from sfm_calib.board_record import BoardResult
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import write_atomically
@@ -31,14 +33,12 @@ class CameraResult(Record):
     size: tuple[int, int]  # width, height in px
     params: dict[str, float]  # OpenCV's names; pixel centres at integers
     sigma: dict[str, float] = Field(default_factory=dict)
-    prior_share: dict[str, float] = Field(
-        default_factory=dict
-    )  # var_posterior / var_prior: 1 belief alone, 0 data alone
+    # var_posterior / var_prior: 1 belief alone, 0 data alone
+    prior_share: dict[str, float] = Field(default_factory=dict)
     n_images: int = 0
     n_observations: int = 0
-    kept_from: Sha256 | Literal[""] = (
-        ""  # of the old calibration, where the scan had no such camera
-    )
+    # Of the old calibration, where the scan had no such camera.
+    kept_from: Sha256 | Literal[""] = ""
 
     @model_validator(mode="after")
     def _params_are_those_of_the_lens(self) -> CameraResult:
@@ -55,6 +55,17 @@ class CamFromRig(Record):
     translation: tuple[float, float, float]  # m when rig.metric, else baselines (rig.scale.source)
     sigma_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about the camera's x, y, z
     sigma_translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, name: str, place: Transform, sigma: Mapping[str, float]) -> CamFromRig:
+        """Of the camera of that name; `sigma` by parameter, 0 where it says none."""
+        told = [sigma.get(parameter, 0.0) for parameter in pose_names(name)]
+        return cls(
+            rotation_wxyz=tuple(place.rotation_wxyz.tolist()),
+            translation=tuple(place.translation.tolist()),
+            sigma_rotation_deg=tuple(np.degrees(told[:3]).tolist()),
+            sigma_translation=tuple(told[3:]),
+        )
 
 
 class ScaleEntry(Record):
@@ -356,17 +367,12 @@ class Calibration(Record):
 
 def truth(cameras: list[Camera], cam_from_rig: list[Transform], version: str) -> Calibration:
     """A calibration known exactly, as a simulation writes it: metric, without sigmas."""
+    placed = zip(cameras, cam_from_rig, strict=True)
     return Calibration(
         cameras={c.name: CameraResult(lens=c.lens, size=c.size, params=c.named()) for c in cameras},
         rig=RigResult(
             reference=cameras[0].name,
-            cam_from_rig={
-                c.name: CamFromRig(
-                    rotation_wxyz=tuple(t.rotation_wxyz.tolist()),
-                    translation=tuple(t.translation.tolist()),
-                )
-                for c, t in zip(cameras, cam_from_rig, strict=True)
-            },
+            cam_from_rig={c.name: CamFromRig.of(c.name, t, {}) for c, t in placed},
             metric=True,
             scale=Scale(source="simulation", sigma_relative=0.0),
         ),
@@ -376,8 +382,7 @@ def truth(cameras: list[Camera], cam_from_rig: list[Transform], version: str) ->
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
     """Write atomically. Raises CalibrationError when the place cannot be written."""
-    content = calibration.model_dump_json(indent=1)
-    write_atomically(path, content + "\n")
+    write_atomically(path, calibration.model_dump_json(indent=1) + "\n")
 
 
 def load_calibration(path: Path) -> Calibration:

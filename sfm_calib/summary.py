@@ -170,16 +170,10 @@ def _unit_name(run: Run) -> Literal["m", "baseline"] | None:
 def _rig(run: Run, cam_from_rig: tuple[Transform, ...], covariance: Covariance) -> result.RigResult:
     problem, names = run.refinement.problem, run.scan.cameras
     sigma, far = covariance.sigma, run.covariance.basis.unit_camera
-    transforms = {}
-    for name, transform in zip(names, cam_from_rig, strict=True):
-        turn = [np.degrees(sigma.get(f"{name}.rotation_{axis}", 0.0)) for axis in "xyz"]
-        move = [sigma.get(f"{name}.translation_{axis}", 0.0) for axis in "xyz"]
-        transforms[name] = result.CamFromRig(
-            rotation_wxyz=tuple(transform.rotation_wxyz.tolist()),
-            translation=tuple(transform.translation.tolist()),
-            sigma_rotation_deg=tuple(turn),
-            sigma_translation=tuple(move),
-        )
+    transforms = {
+        name: result.CamFromRig.of(name, transform, sigma)
+        for name, transform in zip(names, cam_from_rig, strict=True)
+    }
     reference = names[problem.reference]
     scale = result.Scale(source="none: one camera has no length")
     if problem.metric:

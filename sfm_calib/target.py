@@ -23,7 +23,6 @@ from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome, Stopwatch, determine, refusals
 from sfm_calib.config import RigConfig, TargetOptions
 from sfm_calib.errors import CalibrationError
-from sfm_calib.files import sha256
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping import Mapped, reference_of, some
 from sfm_calib.nominal import check_config, known_cameras, lens_of, on_ladder, start_from_config
@@ -71,7 +70,7 @@ def calibrate_target(
         repeated(started, views.views, views, board),
     )
     messages = (*found.messages, *started.notes, *use.messages)
-    hashes = {image.path: sha256(scan.root / image.path) for image in scan.images}
+    hashes = scan.hashes
     mapped = Mapped(problem, messages, hashes)
     given = Given(scan, config, mapped, command, use)
     return determine(given, start_from_config(problem, config), watch, progress)

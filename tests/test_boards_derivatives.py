@@ -19,8 +19,9 @@ from graphs.frames import FloatArray, Transform
 from graphs.keys import board_key, lens_key, rig_key, shape_key
 from graphs.noise import loss_moments
 from graphs.problem import Board, Problem, residuals_px
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.system import System, assemble
+from graphs.threads import threads
 from graphs.tracks import triangulate
 
 SHAPE = np.array([0.2, 0.004, -0.007])

@@ -22,9 +22,10 @@ from graphs.keys import board_key, frame_key, lens_key, rig_key, shape_key
 from graphs.model_covariance import model_covariance
 from graphs.problem import Estimate, Problem
 from graphs.refine import refine
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.stated_covariance import calibration_covariance
 from graphs.system import assemble
+from graphs.threads import threads
 from graphs.tracks import triangulate
 
 SIGMA_PX = 0.2

@@ -18,7 +18,6 @@ from graphs.noise import free_dimensions, noise_classes, redundancies, redundanc
 from graphs.problem import Problem
 from graphs.refine import refine
 from graphs.selection import compact
-from graphs.solve import threads
 from graphs.stated_covariance import (
     _before_fits,
     _of_cells,
@@ -29,6 +28,7 @@ from graphs.stated_covariance import (
     _widened,
     calibration_covariance,
 )
+from graphs.threads import threads
 
 
 def errors_of(problem: Problem) -> tuple[SharedErrors, int]:

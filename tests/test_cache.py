@@ -2,6 +2,8 @@
 
 import errno
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -106,6 +108,62 @@ def test_a_full_disk_that_a_library_hides(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "DISK_IS_FULL", 1 << 62)
     with pytest.raises(CalibrationError, match="MB are free"):
         Cache(tmp_path).stage("a", 1, fail)
+
+
+# ---- shared by runs that go on at once ----------------------------------------------------------
+
+
+def test_a_shared_cache_keeps_a_stage_for_each_of_its_inputs(tmp_path, make):
+    cache = Cache(tmp_path, shared=True)
+    first, second = cache.stage("a", 1, make), cache.stage("a", 2, make)
+    assert make.runs == 2 and first != second
+    assert cache.stage("a", 1, make) == first and make.runs == 2
+    assert (first / "result").read_text() == "run 1" and (second / "result").read_text() == "run 2"
+
+
+def test_what_one_run_makes_the_others_wait_for(tmp_path, make):
+    def slowly(place):
+        time.sleep(0.1)
+        make(place)
+
+    with ThreadPoolExecutor(6) as pool:
+        runs = [
+            pool.submit(Cache(tmp_path, shared=True).stage, "a", n % 2, slowly) for n in range(6)
+        ]
+        places = [run.result() for run in runs]
+    assert make.runs == 2 and len(set(places)) == 2
+    assert all((place / "result").exists() for place in places)
+
+
+def test_a_shared_stage_that_fails_is_made_by_the_next(tmp_path, make):
+    cache = Cache(tmp_path, shared=True)
+
+    def fail(place):
+        (place / "half").write_text("")
+        raise CalibrationError("no overlap")
+
+    for _ in range(2):
+        with pytest.raises(CalibrationError):
+            cache.stage("a", 1, fail)
+    place = cache.stage("a", 1, make)
+    assert make.runs == 1 and [path.name for path in place.iterdir()] == ["result"]
+
+
+def test_a_stage_is_held_by_one_at_a_time(tmp_path, make):
+    """COLMAP aborts where two processes open one database."""
+    cache = Cache(tmp_path, shared=True)
+    place, inside = cache.stage("a", 1, make), []
+
+    def use(number):
+        with cache.held(place):
+            inside.append(number)
+            time.sleep(0.02)
+            assert inside[-1] == number
+            inside.append(-number)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(use, range(1, 9)))
+    assert [a + b for a, b in zip(inside[::2], inside[1::2], strict=True)] == [0] * 8
 
 
 # ---- files -------------------------------------------------------------------------------------

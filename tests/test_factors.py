@@ -21,7 +21,8 @@ from graphs.keys import frame_key, lens_key, rig_key
 from graphs.lenses import LENS_NAMES, LensName
 from graphs.losses import LOSS_NAMES, SCALE_95, LossName
 from graphs.problem import Estimate, Problem
-from graphs.solve import evaluate, linearised, solve, threads
+from graphs.solve import evaluate, linearised, solve
+from graphs.threads import threads
 
 SIGMA_PX = 0.5
 TIGHT = 1e-13  # relative decrease of the cost

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from synthetic.calibrations import NAMES, apart_px, rig_of, rigs, there
 
@@ -63,6 +63,10 @@ def seen_from_first(rig: CameraRig) -> list[Transform]:
 
 @pytest.mark.parametrize("to", ["opencv", "opencv_xml", "opencv_json"])
 @given(name=NAMES)
+@example(name='"')
+@example(name="'")
+@example(name="'both ends'")
+@example(name='"both \\ <ends>"')
 @settings(max_examples=25, deadline=None)
 def test_opencv_reads_what_we_write(to: FormatName, name: str) -> None:
     rig = rig_of("brown", names=(name,))

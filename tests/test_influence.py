@@ -17,7 +17,8 @@ from graphs.losses import LossName, weight_and_slope
 from graphs.model_covariance import calibration_columns
 from graphs.noise import LEAST_REDUNDANCY
 from graphs.problem import IntArray
-from graphs.solve import solve, threads
+from graphs.solve import solve
+from graphs.threads import threads
 
 SIGMA_PX = 0.5
 LOSSES: tuple[LossName, ...] = ("none", "huber", "cauchy")

@@ -37,8 +37,9 @@ from graphs.reference import (
     reference_estimate,
     solve_reference,
 )
-from graphs.solve import SolveSummary, evaluate, linearised, solve, threads
+from graphs.solve import SolveSummary, evaluate, linearised, solve
 from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
+from graphs.threads import threads
 from graphs.unit import unit_jacobian
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 

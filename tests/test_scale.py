@@ -41,9 +41,10 @@ from graphs.reference import (
 )
 from graphs.scale import length_of, total_sigma_m
 from graphs.selection import compact
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.stated_covariance import calibration_covariance
 from graphs.system import assemble
+from graphs.threads import threads
 
 SIGMA_PX = 0.5
 LENGTH_M, SIGMA_M = 2.0, 0.02

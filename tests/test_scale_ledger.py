@@ -31,8 +31,9 @@ from graphs.scale_ledger import (
     scale_ledger,
     source_row,
 )
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.system import assemble
+from graphs.threads import threads
 from sfm_calib.scale_ledger import contradiction
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 

@@ -23,8 +23,9 @@ from graphs.lenses import LensName
 from graphs.losses import SCALE_95, LossName
 from graphs.problem import Estimate, IntArray, Observations, Problem, points_in_cameras
 from graphs.refine import refine
-from graphs.solve import SolveSummary, evaluate, linearised, solve, threads
+from graphs.solve import SolveSummary, evaluate, linearised, solve
 from graphs.stated_covariance import calibration_covariance
+from graphs.threads import threads
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5

@@ -17,7 +17,7 @@ from graphs.model_covariance import model_covariance
 from graphs.priors import LensPrior
 from graphs.problem import KnownSpan, Problem
 from graphs.shrinkage import shrunk
-from graphs.solve import solve, threads
+from graphs.solve import solve
 from graphs.split_check import split_check
 from graphs.stated_covariance import (
     _of_blocks,
@@ -28,6 +28,7 @@ from graphs.stated_covariance import (
     calibration_covariance,
     factors,
 )
+from graphs.threads import threads
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 SIGMA_PX = 0.5

@@ -20,7 +20,7 @@ from graphs.lenses import LENS_NAMES, LensName
 from graphs.losses import INVALID_SIGMAS, LEAST_CURVATURE, LOSS_NAMES, SCALE_95, LossName
 from graphs.problem import Estimate, Observations, Problem, residuals_px
 from graphs.rows import bearing_basis
-from graphs.solve import State, evaluate, linearised, threads
+from graphs.solve import State, evaluate, linearised
 
 SIGMA_PX = 0.5
 POOL = ThreadPoolExecutor(2)
@@ -393,8 +393,8 @@ def test_the_order_of_the_observations_does_not_matter() -> None:
 def test_a_pool_of_any_size_gives_the_same_to_the_last_bit() -> None:
     problem, _ = small_problem("radtan", cameras=3, frames=8, points=60)
     case = case_of(problem, options_of("cauchy"))
-    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(7) as seven, threads() as ours:
-        systems = [linearised(case.graph, case.state, pool) for pool in (one, seven, ours)]
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(7) as seven:
+        systems = [linearised(case.graph, case.state, pool) for pool in (one, POOL, seven)]
         for system in systems[1:]:
             np.testing.assert_array_equal(whole(system), whole(systems[0]))
             np.testing.assert_array_equal(system.gradient, systems[0].gradient)

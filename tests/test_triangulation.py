@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +23,7 @@ from synthetic.calibrated import (
 )
 from synthetic.cameras import SIZE
 
+from graphs import triangulation
 from graphs.camera import Camera
 from graphs.covariance import Covariance
 from graphs.frames import FloatArray, Transform
@@ -234,3 +237,21 @@ def test_what_cannot_be_triangulated_is_refused() -> None:
     pixels[1] = np.nan
     with pytest.raises(ValueError, match=r"cam1: its lens sees nothing at pixel \(nan, nan\)"):
         triangulate(estimate, (0, 1), pixels, SIGMA_PX)
+
+
+def test_noisy_points_take_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding of a cost that is not zero once kept every large batch going for all steps."""
+    estimate, rng = rig(), np.random.default_rng(0)
+    points = rng.uniform([-0.6, -0.5, 2.0], [0.6, 0.5, 5.0], (2000, 3))
+    pixels = pixels_of(estimate, (0, 1), points)
+    steps = 0
+    whole = triangulation._normal_equations
+
+    def counted(*given: Any) -> Any:
+        nonlocal steps
+        steps += 1
+        return whole(*given)
+
+    monkeypatch.setattr(triangulation, "_normal_equations", counted)
+    triangulate(estimate, (0, 1), pixels + SIGMA_PX * rng.standard_normal(pixels.shape), SIGMA_PX)
+    assert steps <= 10

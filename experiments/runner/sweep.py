@@ -167,6 +167,13 @@ def trials_of(config: StudyConfig) -> list[Trial]:
     return trials
 
 
+def in_words(trial: Trial, config: StudyConfig) -> str:
+    """What tells a trial from the others of its study."""
+    options = trial.options.model_dump(mode="json")
+    swept = dict.fromkeys([*config.grid, *(key for one in config.list for key in one)])
+    return ", ".join([*(f"{key}={options[key]}" for key in swept), f"seed={trial.seed}"])
+
+
 def _combinations(config: StudyConfig) -> Iterator[dict[str, Any]]:
     for one in config.list or ({},):
         for values in itertools.product(*config.grid.values()):

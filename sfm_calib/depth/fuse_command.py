@@ -33,8 +33,8 @@ class Fuse:
     calibration: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CALIBRATION")]
     """A calibration of any format that `compare` reads, with the places of the cameras."""
     depths: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEPTHS")]
-    """A folder with a sub-folder of depth images per camera, where files of one stem are one frame;
-    or with one image a camera, called as it. 16-bit PNG, TIFF or PGM; npy, TIFF or EXR in metres."""
+    """A folder with a sub-folder of depth images per camera, files of one stem being one frame;
+    or with one image a camera, called as it. 16-bit PNG, TIFF, PGM; npy, TIFF, EXR in metres."""
     out: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="OUT")]
     """Folder for the clouds."""
     options: Annotated[FuseOptions, tyro.conf.arg(name="")] = field(default_factory=FuseOptions)
@@ -87,7 +87,9 @@ def _print_parts(record: FuseRecord, console: Console) -> None:
         )
     console.print(table)
     if any(part.sigma_m is not None for part in parts):
-        print_line(console, "sigma of a point, by the calibration alone (rms): the depth is its own")
+        print_line(
+            console, "sigma of a point, by the calibration alone (rms): the depth is its own"
+        )
 
 
 def _print_overlaps(record: FuseRecord, console: Console) -> None:
@@ -125,5 +127,3 @@ def _middle(values: Sequence[float | None], unit: float = 1e3) -> str:
     """Median of those that there are."""
     known = [value for value in values if value is not None]
     return f"{unit * float(np.median(known)):.3f}" if known else NONE
-
-

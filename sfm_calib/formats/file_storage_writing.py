@@ -5,8 +5,10 @@ See `file_storage` for what it says.
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from typing import Literal
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
@@ -44,12 +46,12 @@ def write_file_storage(rig: CameraRig, kind: Kind) -> Export:
     if kind != "json":  # which has no comments
         storage.writeComment(WHERE[layout])
     if layout == 1:
-        storage.write(NAME_OF.format(""), cameras[0].name)
+        storage.write(NAME_OF.format(""), _text(cameras[0].name, kind))
         _write_lens(storage, cameras[0], "camera_matrix", "distortion_coefficients")
     else:
         places, of_frame = of_camera(rig)
         for number, camera in enumerate(cameras):
-            storage.write(NAME_OF.format(number + 1), camera.name)
+            storage.write(NAME_OF.format(number + 1), _text(camera.name, kind))
         storage.write(UNIT, rig.unit)
         notes = (*of_frame, *_unit_note(rig), *notes)
         if layout == 2:
@@ -57,6 +59,18 @@ def write_file_storage(rig: CameraRig, kind: Kind) -> Export:
         else:
             _write_several(storage, cameras, places)
     return Export({"": storage.releaseAndGetString().encode()}, notes)
+
+
+def _text(text: str, kind: Kind) -> str:
+    """Ready for OpenCV, which takes a text between two like quotes for one that is quoted already.
+
+    A single quote begins and ends with it too.
+    """
+    if text[:1] not in ('"', "'") or text[0] != text[-1]:
+        return text
+    if kind == "xml":
+        return f'"{escape(text, {chr(34): "&quot;", chr(39): "&apos;"})}"'
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _unit_note(rig: CameraRig) -> tuple[str, ...]:

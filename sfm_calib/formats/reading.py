@@ -16,7 +16,6 @@ from graphs.frames import FloatArray, Transform
 from graphs.lenses import PARAMETER_NAMES, LensName
 from graphs.pose_covariance import rereferenced
 from graphs.problem import Estimate
-from graphs.propagation import pose_names
 from sfm_calib import result
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.result import Calibration, CameraResult, CamFromRig, RigResult, Scale
@@ -172,14 +171,7 @@ class CameraRig:
 
     def _place(self, index: int) -> CamFromRig:
         assert self.cam_from_rig is not None
-        place, sigma = self.cam_from_rig[index], self.covariance.sigma
-        x, y, z, *moved = (sigma.get(name, 0.0) for name in pose_names(self.names[index]))
-        return CamFromRig(
-            rotation_wxyz=tuple(place.rotation_wxyz.tolist()),
-            translation=tuple(place.translation.tolist()),
-            sigma_rotation_deg=tuple(np.degrees([x, y, z]).tolist()),
-            sigma_translation=(moved[0], moved[1], moved[2]),
-        )
+        return CamFromRig.of(self.names[index], self.cam_from_rig[index], self.covariance.sigma)
 
     def metric(self, metres: float) -> CameraRig:
         """The same, its unit of length being so many metres."""

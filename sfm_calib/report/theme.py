@@ -16,6 +16,7 @@ from graphs.frames import FloatArray
 
 Float32Array = NDArray[np.float32]
 
+OWN_PACKAGE = "sfm_calib.report"
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 INK, MUTED, RULE, PAPER = "#1f2937", "#6b7280", "#e5e7eb", "#ffffff"
 BLUE, AMBER, RED = "#2563eb", "#d97706", "#dc2626"
@@ -95,10 +96,12 @@ def figure_html(figure: go.Figure, key: str) -> Markup:
     )
 
 
-def page_template(name: str) -> jinja2.Template:
-    """A page of this package, its outside text escaped."""
+def page_template(name: str, package: str = OWN_PACKAGE) -> jinja2.Template:
+    """A page of a package, its outside text escaped; parts of our own pages can be included."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sfm_calib.report", "."),
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(one, ".") for one in dict.fromkeys((package, OWN_PACKAGE))]
+        ),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -1,0 +1,103 @@
+"""Trials on a Dask cluster that is there: a worker that dies loses nothing."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from typing import Any
+
+from experiments.runner.attempt import Job, attempt, library_versions, stored
+from experiments.runner.rows import StoredRow
+from sfm_calib.errors import CalibrationError
+
+CONNECT_S = 10
+AHEAD = 4  # trials submitted for each worker: none waits for us, and none is sent far too early
+# Workers that may die under one trial before it is to blame; Dask's own default.
+DEATHS = 3
+
+
+def distributed() -> Any:
+    """dask.distributed. Raises CalibrationError where it is not installed."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise CalibrationError(
+            "--cluster needs Dask: pip install 'sfm_calib[cluster]', or leave it away to run on "
+            "this machine"
+        ) from error
+
+
+def run_on_cluster(jobs: Iterable[Job], address: str) -> Iterator[StoredRow]:
+    """Rows as they finish, from the workers of the scheduler at `address`, or of its file.
+
+    Raises CalibrationError when there is no scheduler, when it is lost, and when its workers do not
+    have this project.
+    """
+    dask = distributed()
+    try:
+        place = "scheduler_file" if address.endswith(".json") else "address"
+        client = dask.Client(**{place: address}, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise CalibrationError(
+            f"no Dask scheduler answers at {address} within {CONNECT_S} s: start one with "
+            "`dask scheduler`, and give the address it prints, or its --scheduler-file"
+        ) from error
+    with closing(client):
+        _check_workers(client, address)
+        try:
+            yield from _rows(dask, client, iter(jobs))
+        except (dask.comm.CommClosedError, dask.CancelledError, OSError) as error:
+            raise CalibrationError(
+                f"the scheduler at {address} was lost ({error or type(error).__name__}); finished "
+                "trials are kept: run again to go on"
+            ) from error
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Raises CalibrationError where workers would run another release than this one."""
+    if not client.nthreads():
+        print(f"{address} has no workers yet: start some with `dask worker`", file=sys.stderr)
+        return
+    try:
+        theirs = client.run(library_versions)
+    except Exception as error:
+        raise CalibrationError(
+            f"workers of {address} cannot run studies ({type(error).__name__}: {error}): install "
+            "sfm_calib where they run, in the same release"
+        ) from error
+    ours = library_versions()
+    for worker, versions in theirs.items():
+        other = [
+            f"{n} {versions.get(n)}, here {v}" for n, v in ours.items() if versions.get(n) != v
+        ]
+        if other:
+            raise CalibrationError(
+                f"worker {worker} has {other[0]}: rows would depend on where they ran; install "
+                "what is here, from requirements/dev.lock"
+            )
+
+
+def _rows(dask: Any, client: Any, jobs: Iterator[Job]) -> Iterator[StoredRow]:
+    run = uuid.uuid4().hex  # keys of this run: those of another are other tasks
+    sent: dict[str, Job] = {}
+    finished = dask.as_completed(loop=client.loop)
+
+    def send(count: int) -> None:
+        for _, job in zip(range(count), jobs, strict=False):
+            future = client.submit(attempt, job, key=f"{run}-{job.key}", pure=False)
+            sent[future.key] = job
+            finished.add(future)
+
+    send(AHEAD * max(1, len(client.nthreads())))
+    for future in finished:
+        job = sent.pop(future.key)
+        try:
+            row = future.result()
+        except dask.KilledWorker:
+            row = stored(job, "broken", 0.0, error=f"{DEATHS} workers died of it")
+        future.release()
+        send(AHEAD * max(1, len(client.nthreads())) - len(sent))
+        yield row

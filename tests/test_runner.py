@@ -1,0 +1,391 @@
+"""Runs of studies: rows as they finish, resumed after any end, the same wherever they run."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+
+from experiments.runner.attempt import Job, attempt
+from experiments.runner.rows import StoredRow, read_results, read_row, write_row
+from experiments.runner.run import Plan, plan, run
+from experiments.runner.run_command import RunCommand, duration
+from experiments.runner.sweep import StudyConfig, load_study, trials_of
+from graphs.threads import at_most, threads
+from sfm_calib.cli import main
+from sfm_calib.errors import CalibrationError
+
+STUDY = "study: example\ngrid: {draws: [2, 5]}\nseeds: 4\n"
+KILLS = 20
+
+
+def study(folder: Path, text: str = STUDY) -> Path:
+    path = folder / "some.yaml"
+    path.write_text(text)
+    return path
+
+
+def rows_of(out: Path) -> dict[str, dict[str, object]]:
+    """What was measured, by trial; no times."""
+    return {key: dict(stored.row) for key, stored in read_results(out).finished.items()}
+
+
+def planned(path: Path, out: Path, **kinds: bool) -> Plan:
+    config = load_study(path)
+    out.mkdir(exist_ok=True)
+    return plan(config, trials_of(config), out, 2, **kinds)
+
+
+def here(path: Path, out: Path, **kinds: bool) -> list[StoredRow]:
+    """The rows that this run made."""
+    made: list[StoredRow] = []
+    run(planned(path, out, **kinds), out, None, made.append)
+    return made
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trials run in this process, where nothing rests on the processes of their own."""
+    monkeypatch.setattr(
+        "experiments.runner.run.run_here", lambda jobs, processes: map(attempt, jobs)
+    )
+
+
+def command(path: Path, out: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "sfm_calib", "run", str(path), "-o", str(out), *more]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of all trials, one of which refuses."""
+    folder = tmp_path_factory.mktemp("whole")
+    out = folder / "out"
+    assert (
+        main(["run", str(study(folder, STUDY.replace("[2, 5]", "[1, 2, 5]"))), "-o", str(out)]) == 0
+    )
+    return out
+
+
+# ---- rows ----------------------------------------------------------------------------------
+
+
+def test_every_trial_is_a_row(whole: Path) -> None:
+    results = read_results(whole)
+    assert len(results.trials) == len(results.finished) == len(results.in_order) == 12
+    table = pyarrow.parquet.read_table(whole / "rows.parquet").to_pylist()
+    assert [row["trial.key"] for row in table] == [trial.key for trial in results.trials]
+    assert [(row["options.draws"], row["trial.seed"]) for row in table] == [
+        (draws, seed) for seed in range(4) for draws in (1, 2, 5)
+    ]
+    for row in table:
+        assert row["trial.seconds"] >= 0 and row["trial.version"] and row["trial.created"]
+        assert "numpy" in row["trial.versions"]
+
+
+def test_a_trial_that_refuses_is_a_row_with_its_error(whole: Path) -> None:
+    refused = [f for f in read_results(whole).in_order if f.error is not None]
+    assert [f.options.draws for f in refused] == [1] * 4
+    assert all("give 2 draws" in str(f.error) and not f.row for f in refused)
+
+
+def test_a_row_comes_back_as_it_was(tmp_path: Path) -> None:
+    (trial,) = trials_of(load_study(study(tmp_path, "study: example")))
+    job = Job(trial.key, trial.study, trial.options.model_dump_json(), trial.seed, 1, str(tmp_path))
+    stored = replace(
+        attempt(job),
+        row={"a": 1.5, "b": [1.0, float("nan")], "c": None, "d": "x", "e": True, "f": ["p", "q"]},
+    )
+    write_row(tmp_path, trial, stored)
+    again = read_row(tmp_path / "rows" / f"{trial.key}.parquet")
+    assert repr(again) == repr(stored)
+
+
+def test_bugs_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(draws: int) -> None:
+        raise KeyError("no such thing")
+
+    monkeypatch.setattr("numpy.random.default_rng", broken)
+    row = attempt(Job("k", "example", "{}", 0, 1, str(tmp_path)))
+    assert row.ending == "failed"
+    assert row.error == "KeyError: 'no such thing'"
+    assert row.traceback and "in broken" in row.traceback
+
+
+def test_a_file_that_is_no_row_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "x.parquet"
+    path.write_text("no Parquet")
+    with pytest.raises(CalibrationError, match=r"x\.parquet is no row of a study .*delete it"):
+        read_row(path)
+
+
+# ---- resuming ------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("at_once")
+def test_finished_trials_are_not_run_again(tmp_path: Path) -> None:
+    path, out = study(tmp_path), tmp_path / "out"
+    first = here(path, out)
+    assert len(first) == 8
+    assert not here(path, out)
+    for gone in list((out / "rows").glob("*.parquet"))[:3]:
+        gone.unlink()
+    again = here(path, out)
+    assert len(again) == 3
+    assert {row.key: row.row for row in again}.items() <= {r.key: r.row for r in first}.items()
+    longer = study(tmp_path, STUDY.replace("seeds: 4", "seeds: 5"))
+    assert {row.seed for row in here(longer, out)} == {4}
+    assert len(here(longer, out, fresh=True)) == 10
+
+
+@pytest.mark.usefixtures("at_once")
+def test_rows_of_an_earlier_config_wait_for_its_return(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    here(study(tmp_path), out)
+    here(study(tmp_path, STUDY.replace("seeds: 4", "seeds: 2")), out)
+    assert len(rows_of(out)) == 4
+    assert pyarrow.parquet.read_table(out / "rows.parquet").num_rows == 4
+    assert not here(study(tmp_path), out)
+
+
+@pytest.mark.usefixtures("at_once")
+def test_what_failed_is_run_again_where_that_is_said(tmp_path: Path) -> None:
+    path, out = study(tmp_path, "study: example\ngrid: {draws: [1, 2]}\n"), tmp_path / "out"
+    here(path, out)
+    assert not here(path, out)
+    assert [row.ending for row in here(path, out, retry=True)] == ["refused"]
+
+
+@pytest.mark.usefixtures("at_once")
+def test_changed_inputs_are_run_again(tmp_path: Path) -> None:
+    config = StudyConfig(study="example")
+    (trial,) = trials_of(config)
+    out = tmp_path / "out"
+    out.mkdir()
+    run(plan(config, [trial], out, 1), out, None, lambda row: None)
+    assert not plan(config, [trial], out).todo
+    assert plan(config, [replace(trial, key="0" * 16)], out).todo
+
+
+@pytest.mark.usefixtures("at_once")
+def test_another_study_is_not_mixed_in(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    here(study(tmp_path), out)
+    other = load_study(study(tmp_path)).model_copy(update={"study": "drift"})
+    with pytest.raises(CalibrationError, match="holds results of the study 'example'"):
+        plan(other, [], out)
+
+
+def test_two_runs_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    path, out = study(tmp_path, "study: example\noptions: {pause_s: 20}\n"), tmp_path / "out"
+    with subprocess.Popen(command(path, out), stderr=subprocess.DEVNULL) as first:
+        wait_for(out / "study.yaml")
+        with pytest.raises(CalibrationError, match="another run is writing"):
+            here(path, out)
+        first.send_signal(signal.SIGTERM)
+        assert first.wait(20) == 130
+    assert not rows_of(out)
+
+
+def wait_for(path: Path, seconds: float = 60.0) -> None:
+    until = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < until, f"{path} did not come"
+        time.sleep(0.02)
+
+
+# ---- deaths --------------------------------------------------------------------------------
+
+
+def children(pid: int) -> list[int]:
+    return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_a_worker_that_dies_takes_its_own_trial_alone(tmp_path: Path) -> None:
+    """And the next run does that trial again."""
+    path = study(tmp_path, "study: example\ngrid: {pause_s: [0, 0.01, 0.02, 3]}\n")
+    out, made, killed = tmp_path / "out", [], []
+
+    def told(row: StoredRow) -> None:
+        made.append(row)
+        if len(made) == 3:
+            killed.extend(workers())
+            for pid in killed:
+                os.kill(pid, signal.SIGKILL)
+
+    run(planned(path, out), out, None, told)
+    assert killed
+    assert sorted(row.ending for row in made) == ["broken", "done", "done", "done"]
+    assert [row.ending for row in here(path, out)] == ["done"]
+    assert len(rows_of(out)) == 4
+
+
+def workers() -> list[int]:
+    """Processes of ours that run trials."""
+    spawned = (pid for pid in children(os.getpid()))
+    return [p for p in spawned if b"spawn_main" in Path(f"/proc/{p}/cmdline").read_bytes()]
+
+
+def kill_and_resume(folder: Path, kills: int, rng: random.Random) -> None:
+    """Kill the runner at random moments; in the end there are exactly the rows of a whole run."""
+    path = study(folder, "study: example\ngrid: {draws: [1, 2, 5], pause_s: [0.05]}\nseeds: 60\n")
+    out, whole = folder / "out", folder / "whole"
+    for _ in range(kills):
+        with subprocess.Popen(command(path, out), stderr=subprocess.DEVNULL) as process:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(rng.uniform(1.0, 5.0))
+            own = children(process.pid)
+            process.kill()
+        until = time.monotonic() + 20
+        while any(Path(f"/proc/{pid}").exists() for pid in own):
+            assert time.monotonic() < until, "workers outlive their runner"
+            time.sleep(0.05)
+        for row in (out / "rows").glob("*.parquet"):
+            read_row(row)
+    subprocess.run(command(path, out), check=True, capture_output=True)
+    subprocess.run(command(path, whole, "-j", "1"), check=True, capture_output=True)
+    assert rows_of(out) == rows_of(whole)
+    table = pyarrow.parquet.read_table(out / "rows.parquet")
+    assert table.num_rows == len(set(table["trial.key"].to_pylist())) == 180
+
+
+def test_killed_and_resumed(tmp_path: Path) -> None:
+    kill_and_resume(tmp_path, 1, random.Random(0))
+
+
+@pytest.mark.slow
+def test_killed_twenty_times_and_resumed(tmp_path: Path) -> None:
+    kill_and_resume(tmp_path, KILLS, random.Random(1))
+
+
+# ---- on a cluster --------------------------------------------------------------------------
+
+
+@contextmanager
+def cluster(folder: Path, n_workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A real scheduler and its workers, as people start them: the address, and the workers."""
+    dask = [sys.executable, "-m", "dask"]
+    known = folder / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
+    processes = [
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+             "--scheduler-file", str(known)], **quiet  # type: ignore[call-overload]
+        )
+    ]  # fmt: skip
+    try:
+        wait_for(known)
+        place = ["--scheduler-file", str(known), "--no-dashboard", "--nthreads", "1"]
+        started = [*dask, "worker", *place, "--no-nanny", "--local-directory", str(folder)]
+        workers = [subprocess.Popen(started, **quiet) for _ in range(n_workers)]  # type: ignore[call-overload]
+        processes += workers
+        yield str(known), workers
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path) -> None:
+    path = study(tmp_path, "study: example\ngrid: {draws: [1, 2], pause_s: [0.1]}\nseeds: 30\n")
+    alone, spread, made = tmp_path / "alone", tmp_path / "spread", []
+    here(path, alone)
+    with cluster(tmp_path, 2) as (known, workers):
+
+        def told(row: StoredRow) -> None:
+            made.append(row)
+            if len(made) == 15:
+                workers[0].kill()
+
+        run(planned(path, spread), spread, known, told)
+        assert workers[0].wait() == -signal.SIGKILL
+    assert rows_of(spread) == rows_of(alone)
+    assert len(made) == 60
+    assert {row.ending for row in made} == {"done", "refused"}
+
+
+def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.runner.cluster.CONNECT_S", 0.5)
+    with pytest.raises(CalibrationError, match="no Dask scheduler answers at tcp"):
+        run(
+            planned(study(tmp_path), tmp_path / "out"), tmp_path / "out", "tcp://127.0.0.1:1", print
+        )
+
+
+# ---- the command ---------------------------------------------------------------------------
+
+
+def test_a_dry_run_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = study(tmp_path, STUDY + "seconds: 60\n"), tmp_path / "out"
+    assert main(["run", str(path), "-o", str(out), "--dry-run", "-j", "4"]) == 0
+    said = capsys.readouterr().out
+    assert "8 trials; about 2 min on this machine, 4 at a time" in said
+    assert "draws=5, seed=3" in said
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("at_once")
+def test_time_is_estimated_from_rows_that_are_there(tmp_path: Path) -> None:
+    path, out = study(tmp_path, "study: example\ngrid: {draws: [2, 3]}\n"), tmp_path / "out"
+    rows = here(path, out)
+    slow = {row.key: replace(row, seconds=7.0 + row.row["error"] * 0) for row in rows}  # type: ignore[operator]
+    config = load_study(path, ["seeds=3"])
+    later = Plan(config, trials_of(config), slow, processes=2)
+    assert len(later.todo) == 4
+    assert later.seconds == pytest.approx(14.0)
+    assert Plan(config, trials_of(config), {}, 2).seconds is None
+
+
+def test_its_end_is_told(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = study(tmp_path, STUDY.replace("[2, 5]", "[1, 2, 5]"))
+    assert main(["run", str(path), "-o", str(whole)]) == 0
+    said = capsys.readouterr()
+    assert "12 trials: 4 refused, 8 done" in said.out
+    assert "4 x one number has no scatter" in said.out
+    assert "all 12 trials are finished already" in said.err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--set", "options.drws=2"], "did you mean 'draws'"),
+        (["--jobs", "0"], "--jobs 0: give 1 or more"),
+    ],
+)
+def test_bad_input_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], said: str
+) -> None:
+    out = tmp_path / "out"
+    assert main(["run", str(study(tmp_path)), "-o", str(out), *more]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("at_once")
+def test_results_go_where_the_file_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert RunCommand(study(tmp_path, "study: example"), jobs=1).run([]) == 0
+    assert (tmp_path / "out/some/rows.parquet").exists()
+
+
+def test_times_are_told_as_people_say_them() -> None:
+    assert [duration(s) for s in (0.2, 61, 100, 5400)] == ["1 s", "61 s", "2 min", "1.5 h"]
+
+
+def test_threads_can_be_fewer() -> None:
+    with threads() as free:
+        most = free._max_workers
+    with at_most(1), threads() as one:
+        assert one._max_workers == 1
+    with at_most(None), threads() as every:
+        assert every._max_workers == most
