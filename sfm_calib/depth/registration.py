@@ -23,7 +23,9 @@ Method = Literal["none", "icp"]
 
 MAX_CORRESPONDENCE_M = 0.05
 ITERATIONS = 100
-SETTLED = 1e-3  # of the largest correspondence: a step that moves points by less is the last
+# A step that moves points by less is the last: of the largest correspondence, or of the spacing of
+# points where that is more, for which neighbour is nearest changes to and fro.
+SETTLED, SETTLED_SPACINGS = 1e-3, 1e-2
 MOST_POINTS = 20_000  # that are moved, spread evenly: ten times as many find the same
 LEAST_POINTS = 100  # of an overlap: fewer are chance
 WORSE = 1.05  # rms after over before: a good start is hardly improved
@@ -132,22 +134,37 @@ class Fit:
 
 def fit_part(part: Cloud, others: Cloud, before: Overlap, max_m: float) -> Fit:
     """A part onto the others; where it was, if the fit is none. before: how it overlapped."""
-    some = part.only(evenly(len(part.points), MOST_POINTS))
-    fit, settled = icp(lambda at: overlap(some.moved(at), others, max_m), SETTLED * max_m)
-    after = overlap(part.moved(fit), others, max_m)
-    if reason := _doubt(before, after, fit, settled, max_m):
+    fit, reason = Transform.identity(), _unfit(before, max_m)
+    after = before
+    if not reason:
+        some = part.only(evenly(len(part.points), MOST_POINTS))
+        settled_m = max(SETTLED * max_m, SETTLED_SPACINGS * others.spacing_m)
+        fit, settled = icp(lambda at: overlap(some.moved(at), others, max_m), settled_m)
+        after = overlap(part.moved(fit), others, max_m)
+        reason = _doubt(before, after, fit, max_m) or _unfit(after, max_m)
+        reason = reason or ("" if settled else f"ICP did not settle in {ITERATIONS} steps")
+    if reason:
         return Fit(part, Transform.identity(), before.share, before.rms_m, reason)
     return Fit(part.moved(fit), fit, after.share, after.rms_m, "")
 
 
-def _doubt(before: Overlap, after: Overlap, fit: Transform, settled: bool, max_m: float) -> str:
-    """Why a fit is none; nothing, where it is one."""
-    for pairs, when in ((before, "before"), (after, "after")):
-        if len(pairs.points) < LEAST_POINTS:
-            return (
-                f"{len(pairs.points)} points overlap with other cameras' within {1e3 * max_m:g} mm "
-                f"{when} ICP, and {LEAST_POINTS} are needed"
-            )
+def _unfit(pairs: Overlap, max_m: float) -> str:
+    """Why an overlap can fix no motion; nothing, where it can."""
+    if len(pairs.points) < LEAST_POINTS:
+        return (
+            f"{len(pairs.points)} points overlap with those of other cameras within "
+            f"{1e3 * max_m:g} mm, and {LEAST_POINTS} are needed"
+        )
+    if (hold := hold_of(pairs)) < LEAST_HOLD:
+        return (
+            f"its overlap is flat or round and slides along itself (hold {max(hold, 0.0):.2g}, "
+            f"needs {LEAST_HOLD:g})"
+        )
+    return ""
+
+
+def _doubt(before: Overlap, after: Overlap, fit: Transform, max_m: float) -> str:
+    """Why a fit is none; nothing, where it may be one."""
     shift_m = float(np.median(np.linalg.norm(fit @ before.points - before.points, axis=1)))
     if shift_m > max_m:
         return (
@@ -159,9 +176,7 @@ def _doubt(before: Overlap, after: Overlap, fit: Transform, settled: bool, max_m
             f"the overlap is {1e3 * after.rms_m:.3g} mm rms apart after ICP, and was "
             f"{1e3 * before.rms_m:.3g} mm before"
         )
-    if (hold := hold_of(after)) < LEAST_HOLD:
-        return f"flat or round, the overlap slides along itself ({hold:.2g} of {LEAST_HOLD:g})"
-    return "" if settled else f"ICP did not settle in {ITERATIONS} steps"
+    return ""
 
 
 def hold_of(fitted: Overlap) -> float:
