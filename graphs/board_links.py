@@ -40,9 +40,11 @@ def _link(seen: SeenFrames, cameras: tuple[int, int], a: IntArray, b: IntArray) 
     counts = pair.corners.counts
     scores = [float(np.log1p((each.rms_px / typical) ** 2) @ counts) for each in tried]
     ambiguous = abs(scores[0] - scores[1]) < CLEARLY_BETTER * counts.sum()
-    # Where the images do not tell either, nothing is left but that boards are numbered alike.
-    ranks = [_numbered_apart(each, len(a)) for each in tried] if ambiguous else scores
-    taken = int(ranks[1] < ranks[0])
+    # Where the images hardly tell, boards are rather numbered alike; then the little they tell
+    # decides. A small board always held in one place votes for the rig's mirror image as well, and
+    # that is taken for the rig half of the time without it.
+    apart = [_numbered_apart(each, len(a)) if ambiguous else 0 for each in tried]
+    taken = int((apart[1], scores[1]) < (apart[0], scores[0]))
     placed = tried[taken].cam_from_rig.one(1)
     return replace(choices[taken], b_from_a=placed, ambiguous=bool(ambiguous))
 

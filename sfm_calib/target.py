@@ -62,8 +62,7 @@ def calibrate_target(
         found = find_board(scan, board, progress)
     with watch.stage("starting values"):
         views = found.views
-        started = diverse(start(views, board, config, scan), views, board, config.video_frames)
-        problem = with_lenses(problem_of(started, views, board, reference_of(scan, config)), config)
+        started, problem = started_problem(views, board, config, scan)
     use = BoardUse(
         board,
         left_out(started, views.views, views),
@@ -73,7 +72,19 @@ def calibrate_target(
     hashes = scan.hashes
     mapped = Mapped(problem, messages, hashes)
     given = Given(scan, config, mapped, command, use)
-    return determine(given, start_from_config(problem, config), watch, progress)
+    return determine(given, problem, watch, progress)
+
+
+def started_problem(
+    views: BoardViews, board: spec.Board, config: RigConfig, scan: Scan
+) -> tuple[BoardStart, Problem]:
+    """Where to start from, and the problem that starts there as rig.yaml has it.
+
+    Raises CalibrationError as `start`.
+    """
+    started = diverse(start(views, board, config, scan), views, board, config.video_frames)
+    problem = problem_of(started, views, board, reference_of(scan, config))
+    return started, start_from_config(with_lenses(problem, config), config)
 
 
 def graph_board(board: spec.Board) -> Board:

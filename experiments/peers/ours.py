@@ -62,7 +62,7 @@ def calibrate(
     begin = time.perf_counter()
     problem = problem_of(views, corners, start, options)
     if options.like_opencv:
-        graph, estimate, values = _least_squares(problem)
+        graph, estimate, values = least_squares(problem)
         n_left_out, kept = 0, problem
     else:
         priors = tuple(believing(camera, options) for camera in start.cameras)
@@ -95,7 +95,7 @@ def with_bends_sigma(
     return {name: sigma[name] for name in SHAPE_NAMES[1:]}
 
 
-def _least_squares(problem: Problem) -> tuple[CalibrationGraph, Estimate, gtsam.Values]:
+def least_squares(problem: Problem) -> tuple[CalibrationGraph, Estimate, gtsam.Values]:
     """The optimum of all corners alike and no belief in the lenses."""
     priors = tuple(unbelieving(camera) for camera in problem.initial.cameras)
     options = GraphOptions(loss="none", lens_priors=priors, sigma_px=noise_of(problem))

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from graphs.boards import corners_of
-from graphs.camera import Camera, nominal_params, project
+from graphs.camera import Camera, nominal_params
 from graphs.frames import FloatArray, Transform
 from graphs.problem import Board, BoardPoints, Estimate, Observations, Problem
+from sfm_calib.simulate.board_views import corners_seen
+from sfm_calib.simulate.rigs import SimulatedRig
 
 COLUMNS, ROWS, SQUARE_M = 8, 6, 0.03
 
@@ -60,20 +62,17 @@ def waved(
     truth = Estimate(
         tuple(cameras), tuple(cam_from_rig), rig_from_board, points, None, np.array(shape)
     )
-    pixels, frames, owners, which = [], [], [], []
-    for frame, placed in enumerate(rig_from_board):
-        for index, (lens, to_camera) in enumerate(zip(cameras, cam_from_rig, strict=True)):
-            at = project(lens, to_camera @ (placed @ true_corners))
-            inside = ((at > 0) & (at < np.array(lens.size) - 1)).all(1)
-            corner = np.flatnonzero(inside & (rng.uniform(size=n) < seen))
-            pixels.append(at[corner] + noise_px * rng.standard_normal((len(corner), 2)))
-            frames.append(np.full(len(corner), frame))
-            owners.append(np.full(len(corner), index))
-            which.append(frame * n + corner)
-    observations = Observations(
-        np.concatenate(pixels), np.concatenate(frames), np.concatenate(owners),
-        np.concatenate(which),
+    views = corners_seen(
+        SimulatedRig(tuple(cameras), tuple(cam_from_rig)), rig_from_board, true_corners, noise_px,
+        rng, seen,
     )  # fmt: skip
+    of = [np.full(len(view.corner), 1) for view in views]
+    observations = Observations(
+        np.concatenate([view.pixels for view in views]),
+        np.concatenate([view.frame * one for view, one in zip(views, of, strict=True)]),
+        np.concatenate([view.camera * one for view, one in zip(views, of, strict=True)]),
+        np.concatenate([view.frame * n + view.corner for view in views]),
+    )
     of_board = BoardPoints(
         board, np.tile(np.arange(n), n_frames), np.zeros(n * n_frames, dtype=bool)
     )
