@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -265,3 +266,24 @@ def test_what_only_one_side_has_can_be_left_out(tmp_path: Path) -> None:
     found = record(out)
     assert found["hausdorff_m"] == pytest.approx(0.0101, abs=1e-4)
     assert found["left_out"]["a_to_b"] == 0 and found["left_out"]["b_to_a"] > 10_000  # type: ignore[index]
+
+
+def test_a_closed_stl_has_an_inside(tmp_path: Path) -> None:
+    """Each of its triangles has vertices of its own, which no edge shares."""
+    mesh = open3d.geometry.TriangleMesh.create_sphere(0.1, 12)
+    mesh.compute_triangle_normals()
+    path = tmp_path / "ball.stl"
+    assert open3d.io.write_triangle_mesh(str(path), mesh)
+    ball = load_surface(path)
+    assert ball.is_closed
+    signed = surface_distance(np.array([[0.0, 0, 0.09], [0, 0, 0.11]]), ball).signed
+    assert signed is not None and signed == pytest.approx([-0.01, 0.01], abs=1e-3)
+    assert not Surface(ball.vertices, ball.triangles[1:]).is_closed
+
+
+def test_whether_a_large_mesh_is_closed_takes_no_minutes() -> None:
+    """Of Open3D's own test, which compares every two triangles, hours."""
+    mesh = open3d.geometry.TriangleMesh.create_sphere(0.1, 300)
+    ball = Surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64))
+    start = time.monotonic()
+    assert ball.is_closed and time.monotonic() - start < 20

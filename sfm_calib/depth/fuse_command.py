@@ -18,6 +18,7 @@ from sfm_calib.formats import read_calibration
 from sfm_calib.terminal import print_line, progress_bars, result_console, table_of
 
 NONE = "–"
+PIPED_WIDTH = 100  # of the table of overlaps
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def run_fuse(command: Fuse, told: str) -> None:
     if command.json:
         print(done.record.model_dump_json(indent=1))
         return
-    console = result_console()
+    console = result_console(PIPED_WIDTH)
     print_fused(done.record, console)
     written = ", ".join(str(path) for path in done.written[:2])
     more = f" and {len(done.written) - 2} more" if len(done.written) > 2 else ""
@@ -102,7 +103,7 @@ def _print_overlaps(record: FuseRecord, console: Console) -> None:
     print_line(console, f"overlaps ({limit}): the same surface by two cameras, across it")
     table = table_of(
         "", "points", "share", "median mm", "rms mm", "offset mm", "sigma mm",
-        *(("rms after ICP",) if record.registration != "none" else ()),
+        *(("after ICP",) if record.registration != "none" else ()),
     )  # fmt: skip
     for pair in sorted(rows):
         own = [one for frame in frames for one in frame.overlaps if one.cameras == pair]

@@ -4,7 +4,7 @@ Point-to-plane ICP (Chen and Medioni, 1992) over the points that `overlap` says 
 surface. Open3D's ICP takes every point within a distance, and pulls the borders of clouds together
 that overlap but partly. Three simulated depth cameras around a head, a side one moved by 4 degrees
 and 30 mm, 2 mm of noise: Open3D's ends 50 mm off with correspondences within 50 mm, 7 mm off with
-20 mm; this ends 0.2 mm off, and 0.8 mm with 4 mm of noise, where Open3D's diverges.
+20 mm; this 0.2 to 0.6 mm, and with 4 mm of noise 0.5 to 1.6 mm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ Method = Literal["none", "icp"]
 
 MAX_CORRESPONDENCE_M = 0.05
 ITERATIONS = 100
-SETTLED = 1e-3  # of the largest correspondence: a step that moves points by less is the last
+# A step that moves points by less is the last: of the largest correspondence, or of the spacing of
+# points where that is more, for which neighbour is nearest changes to and fro.
+SETTLED, SETTLED_SPACINGS = 1e-3, 1e-2
 MOST_POINTS = 20_000  # that are moved, spread evenly: ten times as many find the same
 LEAST_POINTS = 100  # of an overlap: fewer are chance
 WORSE = 1.05  # rms after over before: a good start is hardly improved
@@ -132,22 +134,39 @@ class Fit:
 
 def fit_part(part: Cloud, others: Cloud, before: Overlap, max_m: float) -> Fit:
     """A part onto the others; where it was, if the fit is none. before: how it overlapped."""
+    if few := _few(before, max_m):
+        return Fit(part, Transform.identity(), before.share, before.rms_m, few)
     some = part.only(evenly(len(part.points), MOST_POINTS))
-    fit, settled = icp(lambda at: overlap(some.moved(at), others, max_m), SETTLED * max_m)
+    settled_m = max(SETTLED * max_m, SETTLED_SPACINGS * others.spacing_m)
+    fit, settled = icp(lambda at: overlap(some.moved(at), others, max_m), settled_m)
     after = overlap(part.moved(fit), others, max_m)
-    if reason := _doubt(before, after, fit, settled, max_m):
+    reason = _few(after, max_m) or _doubt(before, after, fit, max_m)
+    reason = reason or ("" if settled else f"ICP did not settle in {ITERATIONS} steps")
+    if reason:
         return Fit(part, Transform.identity(), before.share, before.rms_m, reason)
     return Fit(part.moved(fit), fit, after.share, after.rms_m, "")
 
 
-def _doubt(before: Overlap, after: Overlap, fit: Transform, settled: bool, max_m: float) -> str:
-    """Why a fit is none; nothing, where it is one."""
-    for pairs, when in ((before, "before"), (after, "after")):
-        if len(pairs.points) < LEAST_POINTS:
-            return (
-                f"{len(pairs.points)} points overlap with other cameras' within {1e3 * max_m:g} mm "
-                f"{when} ICP, and {LEAST_POINTS} are needed"
-            )
+def _few(pairs: Overlap, max_m: float) -> str:
+    """Why an overlap is none; nothing, where it is one."""
+    if len(pairs.points) >= LEAST_POINTS:
+        return ""
+    return (
+        f"{len(pairs.points)} points overlap with those of other cameras within {1e3 * max_m:g} "
+        f"mm, and {LEAST_POINTS} are needed"
+    )
+
+
+def _doubt(before: Overlap, after: Overlap, fit: Transform, max_m: float) -> str:
+    """Why a fit is none; nothing, where it may be one.
+
+    How the surface holds is judged afterwards: of parts far apart, wrong points are matched.
+    """
+    if (hold := hold_of(after)) < LEAST_HOLD:
+        return (
+            f"its overlap is flat or round and slides along itself (hold {max(hold, 0.0):.2g}, "
+            f"needs {LEAST_HOLD:g})"
+        )
     shift_m = float(np.median(np.linalg.norm(fit @ before.points - before.points, axis=1)))
     if shift_m > max_m:
         return (
@@ -159,9 +178,7 @@ def _doubt(before: Overlap, after: Overlap, fit: Transform, settled: bool, max_m
             f"the overlap is {1e3 * after.rms_m:.3g} mm rms apart after ICP, and was "
             f"{1e3 * before.rms_m:.3g} mm before"
         )
-    if (hold := hold_of(after)) < LEAST_HOLD:
-        return f"flat or round, the overlap slides along itself ({hold:.2g} of {LEAST_HOLD:g})"
-    return "" if settled else f"ICP did not settle in {ITERATIONS} steps"
+    return ""
 
 
 def hold_of(fitted: Overlap) -> float:
