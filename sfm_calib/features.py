@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
 from graphs.problem import IntArray
+from graphs.threads import threads
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan
 
@@ -53,7 +53,7 @@ def extract(scan: Scan, max_features: int, place: Path, progress: Progress) -> N
     """Find the features of every image and keep them in `place`."""
     cv2.setNumThreads(1)  # images are shared out, not rows
     found = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with threads() as pool:
         paths = [scan.root / image.path for image in scan.images]
         for one in pool.map(lambda path: features_of(path, max_features), paths):
             found.append(one)

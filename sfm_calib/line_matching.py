@@ -6,9 +6,7 @@ are matched in a third of the time that all against all take, and wrong matches 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from graphs.camera import Camera, focal_on_axis, unproject
 from graphs.frames import FloatArray, Transform
 from graphs.problem import IntArray
+from graphs.threads import threads
 from sfm_calib.features import Features
 from sfm_calib.pairs import Pair
 
@@ -64,7 +63,7 @@ def match_pairs(
         assert a is not None and b is not None and from_a is not None and from_b is not None
         return match_along_lines(a, b, from_b @ from_a.inverse)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with threads() as pool:
         yield from pool.map(match, pairs)
 
 

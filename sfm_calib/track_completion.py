@@ -6,9 +6,7 @@ found where it projects: after a gap, from another camera at another time, when 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,6 +14,7 @@ from scipy.spatial import cKDTree
 from graphs.camera import project
 from graphs.frames import FloatArray, Transform
 from graphs.problem import Estimate, IntArray
+from graphs.threads import threads
 from sfm_calib.features import Features
 from sfm_calib.line_matching import MOST_ANGLE
 
@@ -79,7 +78,7 @@ def links_to_points(
         there = begins[number] + seen_here[which[best]]
         return np.stack([feature[rows[best]], there], axis=1), alike[best].astype(np.float64)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with threads() as pool:
         yield from pool.map(look, images)
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import random
 import signal
 import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet
 import pytest
+from synthetic.studies import STUDY, command, here, planned, rows_of, study, wait_for
 
+from experiments import example
 from experiments.runner.attempt import Job, attempt
 from experiments.runner.rows import StoredRow, read_results, read_row, write_row
 from experiments.runner.run import Plan, plan, run
@@ -25,33 +21,6 @@ from graphs.threads import at_most, threads
 from sfm_calib.cli import main
 from sfm_calib.errors import CalibrationError
 
-STUDY = "study: example\ngrid: {draws: [2, 5]}\nseeds: 4\n"
-KILLS = 20
-
-
-def study(folder: Path, text: str = STUDY) -> Path:
-    path = folder / "some.yaml"
-    path.write_text(text)
-    return path
-
-
-def rows_of(out: Path) -> dict[str, dict[str, object]]:
-    """What was measured, by trial; no times."""
-    return {key: dict(stored.row) for key, stored in read_results(out).finished.items()}
-
-
-def planned(path: Path, out: Path, **kinds: bool) -> Plan:
-    config = load_study(path)
-    out.mkdir(exist_ok=True)
-    return plan(config, trials_of(config), out, 2, **kinds)
-
-
-def here(path: Path, out: Path, **kinds: bool) -> list[StoredRow]:
-    """The rows that this run made."""
-    made: list[StoredRow] = []
-    run(planned(path, out, **kinds), out, None, made.append)
-    return made
-
 
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,10 +28,6 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "experiments.runner.run.run_here", lambda jobs, processes: map(attempt, jobs)
     )
-
-
-def command(path: Path, out: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "sfm_calib", "run", str(path), "-o", str(out), *more]
 
 
 @pytest.fixture(scope="module")
@@ -165,8 +130,59 @@ def test_what_failed_is_run_again_where_that_is_said(tmp_path: Path) -> None:
     assert [row.ending for row in here(path, out, retry=True)] == ["refused"]
 
 
+@pytest.mark.parametrize("row", [{"a": [1.0, "x"]}, {"a": 2**70}, {"a": "\udcff"}])
+def test_what_no_file_can_hold_is_a_failed_trial(
+    row: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(example, "STUDY", replace(example.STUDY, trial=lambda options, seed: row))
+    stored = attempt(Job("k", "example", "{}", 0, 1, str(tmp_path)))
+    assert stored.ending in ("failed", "refused") and not stored.row
+    (trial,) = trials_of(load_study(study(tmp_path, "study: example")))
+    write_row(tmp_path, trial, stored)
+    assert read_row(tmp_path / "rows/k.parquet").error == stored.error
+
+
 @pytest.mark.usefixtures("at_once")
-def test_changed_inputs_are_run_again(tmp_path: Path) -> None:
+def test_columns_of_several_kinds_are_texts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trial(options: object, seed: int) -> dict[str, object]:
+        return {"a": (1, "one", None, 2.5)[seed], "b": (1, 2.5, None, 3)[seed]}
+
+    monkeypatch.setattr(example, "STUDY", replace(example.STUDY, trial=trial))
+    out = tmp_path / "out"
+    here(study(tmp_path, "study: example\nseeds: 4"), out)
+    table = pyarrow.parquet.read_table(out / "rows.parquet")
+    assert table["a"].to_pylist() == ["1", '"one"', "null", "2.5"]
+    assert table["b"].to_pylist() == [1, 2.5, None, 3]
+
+
+@pytest.mark.usefixtures("at_once")
+def test_what_is_done_anew_leaves_nothing_old_behind(tmp_path: Path) -> None:
+    """Though it is interrupted."""
+    path, out = study(tmp_path), tmp_path / "out"
+    here(path, out)
+
+    def interrupt(row: StoredRow) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(planned(path, out, fresh=True), out, None, interrupt)
+    assert len(rows_of(out)) == 1
+    assert len(here(path, out)) == 7
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_run_that_waited_does_not_repeat_what_another_did(tmp_path: Path) -> None:
+    path, out = study(tmp_path), tmp_path / "out"
+    late, made = planned(path, out), []
+    here(path, out)
+    assert len(run(late, out, None, made.append)) == 8
+    assert not made
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_changed_key_is_run_again(tmp_path: Path) -> None:
     config = StudyConfig(study="example")
     (trial,) = trials_of(config)
     out = tmp_path / "out"
@@ -194,131 +210,6 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path: Path) -> None:
         first.send_signal(signal.SIGTERM)
         assert first.wait(20) == 130
     assert not rows_of(out)
-
-
-def wait_for(path: Path, seconds: float = 60.0) -> None:
-    until = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < until, f"{path} did not come"
-        time.sleep(0.02)
-
-
-# ---- deaths --------------------------------------------------------------------------------
-
-
-def children(pid: int) -> list[int]:
-    return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def test_a_worker_that_dies_takes_its_own_trial_alone(tmp_path: Path) -> None:
-    """And the next run does that trial again."""
-    path = study(tmp_path, "study: example\ngrid: {pause_s: [0, 0.01, 0.02, 3]}\n")
-    out, made, killed = tmp_path / "out", [], []
-
-    def told(row: StoredRow) -> None:
-        made.append(row)
-        if len(made) == 3:
-            killed.extend(workers())
-            for pid in killed:
-                os.kill(pid, signal.SIGKILL)
-
-    run(planned(path, out), out, None, told)
-    assert killed
-    assert sorted(row.ending for row in made) == ["broken", "done", "done", "done"]
-    assert [row.ending for row in here(path, out)] == ["done"]
-    assert len(rows_of(out)) == 4
-
-
-def workers() -> list[int]:
-    """Processes of ours that run trials."""
-    spawned = (pid for pid in children(os.getpid()))
-    return [p for p in spawned if b"spawn_main" in Path(f"/proc/{p}/cmdline").read_bytes()]
-
-
-def kill_and_resume(folder: Path, kills: int, rng: random.Random) -> None:
-    """Kill the runner at random moments; in the end there are exactly the rows of a whole run."""
-    path = study(folder, "study: example\ngrid: {draws: [1, 2, 5], pause_s: [0.05]}\nseeds: 60\n")
-    out, whole = folder / "out", folder / "whole"
-    for _ in range(kills):
-        with subprocess.Popen(command(path, out), stderr=subprocess.DEVNULL) as process:
-            with pytest.raises(subprocess.TimeoutExpired):
-                process.wait(rng.uniform(1.0, 5.0))
-            own = children(process.pid)
-            process.kill()
-        until = time.monotonic() + 20
-        while any(Path(f"/proc/{pid}").exists() for pid in own):
-            assert time.monotonic() < until, "workers outlive their runner"
-            time.sleep(0.05)
-        for row in (out / "rows").glob("*.parquet"):
-            read_row(row)
-    subprocess.run(command(path, out), check=True, capture_output=True)
-    subprocess.run(command(path, whole, "-j", "1"), check=True, capture_output=True)
-    assert rows_of(out) == rows_of(whole)
-    table = pyarrow.parquet.read_table(out / "rows.parquet")
-    assert table.num_rows == len(set(table["trial.key"].to_pylist())) == 180
-
-
-def test_killed_and_resumed(tmp_path: Path) -> None:
-    kill_and_resume(tmp_path, 1, random.Random(0))
-
-
-@pytest.mark.slow
-def test_killed_twenty_times_and_resumed(tmp_path: Path) -> None:
-    kill_and_resume(tmp_path, KILLS, random.Random(1))
-
-
-# ---- on a cluster --------------------------------------------------------------------------
-
-
-@contextmanager
-def cluster(folder: Path, n_workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A real scheduler and its workers, as people start them: the address, and the workers."""
-    dask = [sys.executable, "-m", "dask"]
-    known = folder / "scheduler.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
-    processes = [
-        subprocess.Popen(
-            [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-             "--scheduler-file", str(known)], **quiet  # type: ignore[call-overload]
-        )
-    ]  # fmt: skip
-    try:
-        wait_for(known)
-        place = ["--scheduler-file", str(known), "--no-dashboard", "--nthreads", "1"]
-        started = [*dask, "worker", *place, "--no-nanny", "--local-directory", str(folder)]
-        workers = [subprocess.Popen(started, **quiet) for _ in range(n_workers)]  # type: ignore[call-overload]
-        processes += workers
-        yield str(known), workers
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
-def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path) -> None:
-    path = study(tmp_path, "study: example\ngrid: {draws: [1, 2], pause_s: [0.1]}\nseeds: 30\n")
-    alone, spread, made = tmp_path / "alone", tmp_path / "spread", []
-    here(path, alone)
-    with cluster(tmp_path, 2) as (known, workers):
-
-        def told(row: StoredRow) -> None:
-            made.append(row)
-            if len(made) == 15:
-                workers[0].kill()
-
-        run(planned(path, spread), spread, known, told)
-        assert workers[0].wait() == -signal.SIGKILL
-    assert rows_of(spread) == rows_of(alone)
-    assert len(made) == 60
-    assert {row.ending for row in made} == {"done", "refused"}
-
-
-def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("experiments.runner.cluster.CONNECT_S", 0.5)
-    with pytest.raises(CalibrationError, match="no Dask scheduler answers at tcp"):
-        run(
-            planned(study(tmp_path), tmp_path / "out"), tmp_path / "out", "tcp://127.0.0.1:1", print
-        )
 
 
 # ---- the command ---------------------------------------------------------------------------

@@ -53,6 +53,12 @@ def test_settings_take_the_place_of_what_is_swept(tmp_path: Path) -> None:
     assert [(t.options.draws, t.options.sigma) for t in trials] == [(9, 3), (9, 4)]  # type: ignore[attr-defined]
 
 
+def test_a_setting_joins_what_was_listed_apart(tmp_path: Path) -> None:
+    path = config(tmp_path, "study: example\nlist: [{draws: 2}, {draws: 3}, {draws: 3, sigma: 2}]")
+    trials = trials_of(load_study(path, ["options.draws=9"]))
+    assert [(t.options.draws, t.options.sigma) for t in trials] == [(9, 1), (9, 2)]  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -61,6 +67,7 @@ def test_settings_take_the_place_of_what_is_swept(tmp_path: Path) -> None:
         ("study: example\nseed: 3", "unknown key 'seed': did you mean 'seeds'?"),
         ("study: example\nseeds: 0", "seeds"),
         ("study: example\nthreads: 0", "threads"),
+        ("study: example\nseeds: [-1]", "seeds"),
         ("study: example\noptions: {drws: 3}", "has no option 'drws': did you mean 'draws'?"),
         ("study: example\ngrid: {sigm: [3]}", "grid: example has no option 'sigm'"),
         ("study: example\nlist: [{sgma: 3}]", "list: example has no option 'sgma'"),
@@ -111,7 +118,14 @@ def test_content_decides_what_a_folder_is(tmp_path: Path) -> None:
     folder = tmp_path / "scan"
     (folder / "left").mkdir(parents=True)
     (folder / "left" / "a.txt").write_text("1")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere/b.txt").write_text("1")
+    (folder / "right").symlink_to(tmp_path / "elsewhere")
+    (folder / "left" / "round").symlink_to(folder)
     before = sweep.content_digest(folder)
+    (tmp_path / "elsewhere/b.txt").write_text("2")
+    assert sweep.content_digest(folder) != before
+    (tmp_path / "elsewhere/b.txt").write_text("1")
     (folder / "left" / "a.txt").write_text("1")
     assert sweep.content_digest(folder) == before
     (folder / "left" / "a.txt").write_text("2")

@@ -8,20 +8,22 @@ import subprocess
 import threading
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
 import sfm_calib
 from experiments.runner.protocol import Cell
 from experiments.runner.registry import study_of
-from experiments.runner.rows import Ending, StoredRow, error_line, now
+from experiments.runner.rows import Ending, StoredRow, cell, check_cells, error_line, now
 from graphs.threads import at_most
 from sfm_calib.errors import BrokenDownError, CalibrationError
 
 LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "pycolmap", "opencv-contrib-python-headless")
+GIT = "git"  # the name of the code's own state among versions
 TRIALS_FOLDER = "trials"
 ONE_AT_A_TIME = threading.Lock()  # kernels of one process cannot be used by two of its threads
 
@@ -42,19 +44,23 @@ class Job:
 
 def attempt(job: Job) -> StoredRow:
     """Run a trial; whatever it raises becomes its row."""
-    study = study_of(job.study)
-    options = study.options.model_validate_json(job.options)
-    folder = {"folder": trial_folder(Path(job.results), job.key)} if study.folder else {}
     with ONE_AT_A_TIME, at_most(None if job.threads == "all" else job.threads):
         began = time.perf_counter()
         try:
-            row = dict(study.trial(options, job.seed, **folder))
-        except Exception as error:
+            study = study_of(job.study)
+            options = study.options.model_validate_json(job.options)
+            folder = {"folder": trial_folder(Path(job.results), job.key)} if study.folder else {}
+            row = {
+                name: cell(value)
+                for name, value in study.trial(options, job.seed, **folder).items()
+            }
+            check_cells(row)
+        except (Exception, SystemExit) as error:
             return failed(job, error, time.perf_counter() - began)
         return stored(job, "done", time.perf_counter() - began, row=row)
 
 
-def failed(job: Job, error: Exception, seconds: float) -> StoredRow:
+def failed(job: Job, error: BaseException, seconds: float) -> StoredRow:
     """The row of a trial that raised an error: a refusal, the machine's fault, or a bug."""
     message, trace = error_line(error), "".join(traceback.format_exception(error))
     if isinstance(error, BrokenDownError | MemoryError):
@@ -100,7 +106,16 @@ def trial_folder(results: Path, key: str) -> Path:
 @cache
 def library_versions() -> dict[str, str]:
     """Python's, and of the libraries that decide numbers."""
-    return {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+    known = {"python": platform.python_version(), "sfm_calib": sfm_calib.__version__}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):  # OpenCV comes under several names
+            known[name] = version(name)
+    return known
+
+
+def code_state() -> dict[str, str]:
+    """What rows depend on beside their options: it must be alike wherever trials run."""
+    return {**library_versions(), GIT: git_state()}
 
 
 @cache

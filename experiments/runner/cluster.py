@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from typing import Any
 
-from experiments.runner.attempt import Job, attempt, library_versions, stored
+from experiments.runner.attempt import GIT, Job, attempt, code_state, failed, stored
 from experiments.runner.rows import StoredRow
 from sfm_calib.errors import CalibrationError
 
@@ -62,21 +62,24 @@ def _check_workers(client: Any, address: str) -> None:
         print(f"{address} has no workers yet: start some with `dask worker`", file=sys.stderr)
         return
     try:
-        theirs = client.run(library_versions)
+        theirs = client.run(code_state)
     except Exception as error:
         raise CalibrationError(
             f"workers of {address} cannot run studies ({type(error).__name__}: {error}): install "
             "sfm_calib where they run, in the same release"
         ) from error
-    ours = library_versions()
-    for worker, versions in theirs.items():
-        other = [
-            f"{n} {versions.get(n)}, here {v}" for n, v in ours.items() if versions.get(n) != v
-        ]
-        if other:
+    for worker, state in theirs.items():
+        _check_alike(f"worker {worker}", state)
+
+
+def _check_alike(worker: str, state: dict[str, str]) -> None:
+    """Raises CalibrationError where rows would depend on where they ran."""
+    for name, here in code_state().items():
+        there = state.get(name, "none")
+        if there != here and (name != GIT or (here and there)):  # installed, it knows no commit
             raise CalibrationError(
-                f"worker {worker} has {other[0]}: rows would depend on where they ran; install "
-                "what is here, from requirements/dev.lock"
+                f"{worker} has {name} {there}, and here it is {here}: rows would depend on where "
+                "they ran; install what is here, from requirements/dev.lock"
             )
 
 
@@ -96,8 +99,14 @@ def _rows(dask: Any, client: Any, jobs: Iterator[Job]) -> Iterator[StoredRow]:
         job = sent.pop(future.key)
         try:
             row = future.result()
+            # Of a worker that came after the first look.
+            _check_alike(f"the worker on {row.host}", {**row.versions, GIT: row.git})
         except dask.KilledWorker:
             row = stored(job, "broken", 0.0, error=f"{DEATHS} workers died of it")
+        except (CalibrationError, OSError, dask.CancelledError, dask.comm.CommClosedError):
+            raise
+        except Exception as error:  # of the way there or back
+            row = failed(job, error, 0.0)
         future.release()
         send(AHEAD * max(1, len(client.nthreads())) - len(sent))
         yield row

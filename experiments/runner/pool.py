@@ -30,8 +30,23 @@ class Slot:
         context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
         self._executor = ProcessPoolExecutor(1, context, initializer=prepare_worker)
 
-    def send(self, job: Job) -> None:
-        self.sent.append((job, self._executor.submit(attempt, job)))
+    def send(self, job: Job) -> bool:
+        """Whether it could be sent: not to a process that has died with trials to collect."""
+        try:
+            future = self._executor.submit(attempt, job)
+        except BrokenProcessPool:
+            if self.sent:
+                return False
+            self._start()
+            future = self._executor.submit(attempt, job)
+        self.sent.append((job, future))
+        return True
+
+    def end(self) -> None:
+        """Kill the process, whatever it does."""
+        for process in list((self._executor._processes or {}).values()):
+            process.kill()
+        self._executor.shutdown(wait=False, cancel_futures=True)
 
     def collect(self) -> tuple[list[StoredRow], list[Job]]:
         """Rows that are there, and trials that must be sent anew because the process died."""
@@ -42,6 +57,7 @@ class Slot:
                 rows.append(future.result())
             except BrokenProcessPool:
                 rows.append(stored(job, "broken", 0.0, error=DIED))
+                self._executor.shutdown(wait=False)
                 again = [job for job, _ in self.sent]
                 self.sent.clear()
                 self._start()
@@ -57,16 +73,16 @@ def run_here(jobs: Iterable[Job], processes: int) -> Iterator[StoredRow]:
         while todo or any(slot.sent for slot in slots):
             for turn in range(1 + WAITING):
                 for slot in slots:
-                    if todo and len(slot.sent) <= turn:
-                        slot.send(todo.popleft())
+                    if todo and len(slot.sent) <= turn and slot.send(todo[0]):
+                        todo.popleft()
             wait((slot.sent[0][1] for slot in slots if slot.sent), return_when=FIRST_COMPLETED)
             for slot in slots:
                 rows, again = slot.collect()
                 todo.extendleft(reversed(again))
                 yield from rows
     finally:
-        for process in multiprocessing.active_children():
-            process.kill()
+        for slot in slots:
+            slot.end()
 
 
 def prepare_worker() -> None:

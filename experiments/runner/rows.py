@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -90,8 +90,8 @@ def write_row(results: Path, trial: Trial, stored: StoredRow) -> None:
     """Write a trial's row: whole, or not at all."""
     columns: dict[str, Cell] = {META + "key": stored.key, META + "study": trial.study}
     for name, value in trial.options.model_dump(mode="json").items():
-        columns[OPTIONS + name] = _cell(value)
-    columns |= {name: _cell(value) for name, value in stored.row.items()}
+        columns[OPTIONS + name] = cell(value)
+    columns |= stored.row
     columns |= {
         META + "seed": stored.seed,
         META + "ending": stored.ending,
@@ -109,7 +109,12 @@ def write_row(results: Path, trial: Trial, stored: StoredRow) -> None:
     write_atomically(results / ROWS_FOLDER / f"{stored.key}.parquet", _bytes(table))
 
 
-def _cell(value: Any) -> Any:
+def check_cells(row: Mapping[str, Cell]) -> None:
+    """Raises what Parquet raises where it cannot hold them, such as lists of texts and numbers."""
+    arrow().Table.from_pylist([dict(row)])
+
+
+def cell(value: Any) -> Any:
     """As Parquet holds it: what is nested becomes JSON, and numpy's numbers Python's."""
     if hasattr(value, "tolist"):
         value = value.tolist()
@@ -184,6 +189,12 @@ def read_results(results: Path) -> Results:
     return Results(config, trials, read_rows(results, trials))
 
 
+def forget(results: Path, trials: Sequence[Trial]) -> None:
+    """Remove the rows of trials that are done again: whatever interrupts that, none is old."""
+    for trial in trials:
+        (results / ROWS_FOLDER / f"{trial.key}.parquet").unlink(missing_ok=True)
+
+
 def write_config(results: Path, config: StudyConfig, trials: Sequence[Trial]) -> None:
     """Write what the rows of RESULTS are of: to read them, no file that trials read is needed."""
     listed = [
@@ -213,8 +224,33 @@ def write_all(results: Path, trials: Sequence[Trial]) -> None:
     paths = (folder / f"{trial.key}.parquet" for trial in trials)
     tables = [arrow().parquet.ParquetFile(path).read() for path in paths if path.exists()]
     if tables:
-        table = arrow().concat_tables(tables, promote_options="permissive")
-        write_atomically(results / ROWS_FILE, _bytes(table))
+        write_atomically(results / ROWS_FILE, _bytes(_joined(tables)))
+
+
+def _joined(tables: Sequence[Any]) -> Any:
+    """One table; a column that is of several kinds, in several rows, becomes JSON texts."""
+    pyarrow = arrow()
+    try:
+        return pyarrow.concat_tables(tables, promote_options="permissive")
+    except (pyarrow.ArrowTypeError, pyarrow.ArrowInvalid):
+        rows = [row for table in tables for row in table.to_pylist()]
+        kinds: dict[str, set[str]] = {}
+        for row in rows:
+            for name, value in row.items():
+                kinds.setdefault(name, set()).update(_kind(value))
+        mixed = {name for name, of in kinds.items() if len(of) > 1}
+        texts = [{n: json.dumps(v) if n in mixed else v for n, v in row.items()} for row in rows]
+        return pyarrow.concat_tables(
+            [pyarrow.Table.from_pylist([row]) for row in texts], promote_options="permissive"
+        )
+
+
+def _kind(value: object) -> tuple[str, ...]:
+    """What a column may hold one of, besides nothing."""
+    if value is None:
+        return ()
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return ("number" if number else type(value).__name__,)
 
 
 def now() -> datetime:

@@ -18,6 +18,7 @@ from experiments.runner.pool import run_here
 from experiments.runner.rows import (
     STUDY_FILE,
     StoredRow,
+    forget,
     read_rows,
     write_all,
     write_config,
@@ -39,6 +40,7 @@ class Plan:
     trials: Sequence[Trial]
     finished: dict[str, StoredRow]
     processes: int  # on this machine
+    again: bool = False  # rows that are there are made anew
 
     @property
     def todo(self) -> list[Trial]:
@@ -81,18 +83,23 @@ def plan(
 
     Raises CalibrationError where OUT holds another study.
     """
+    check_study(out, config)
+    rows = {} if fresh else read_rows(out, trials)
+    again = ("broken", "failed", "refused") if retry else ("broken",)
+    rows = {key: row for key, row in rows.items() if row.ending not in again}
+    cores = len(os.sched_getaffinity(0))
+    threads = cores if config.threads == "all" else config.threads
+    return Plan(config, trials, rows, processes or max(1, cores // threads), retry or fresh)
+
+
+def check_study(out: Path, config: StudyConfig) -> None:
+    """Raises CalibrationError where OUT holds another study."""
     if (out / STUDY_FILE).exists():
         other = load_study(out / STUDY_FILE).study
         if other != config.study:
             raise CalibrationError(
                 f"{out} holds results of the study {other!r}: choose another folder with -o"
             )
-    rows = {} if fresh else read_rows(out, trials)
-    again = ("broken", "failed", "refused") if retry else ("broken",)
-    rows = {key: row for key, row in rows.items() if row.ending not in again}
-    cores = len(os.sched_getaffinity(0))
-    threads = cores if config.threads == "all" else config.threads
-    return Plan(config, trials, rows, processes or max(1, cores // threads))
 
 
 def run(plan: Plan, out: Path, cluster: str | None, told: Told) -> dict[str, StoredRow]:
@@ -103,9 +110,13 @@ def run(plan: Plan, out: Path, cluster: str | None, told: Told) -> dict[str, Sto
     Raises CalibrationError where another run writes to OUT, and as `run_on_cluster`.
     """
     with locked(out):
+        check_study(out, plan.config)
+        done = read_rows(out, plan.todo) if not plan.again else {}  # by a run that has just ended
+        rows = {**plan.finished, **{k: r for k, r in done.items() if r.ending != "broken"}}
+        todo = {trial.key: trial for trial in plan.trials if trial.key not in rows}
+        forget(out, list(todo.values()))
         write_config(out, plan.config, plan.trials)
-        rows, todo = dict(plan.finished), {trial.key: trial for trial in plan.todo}
-        jobs = (job_of(trial, plan.config, out) for trial in plan.todo)
+        jobs = (job_of(trial, plan.config, out) for trial in todo.values())
         try:
             running = run_on_cluster(jobs, cluster) if cluster else run_here(jobs, plan.processes)
             for row in running:

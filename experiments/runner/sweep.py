@@ -6,6 +6,8 @@ import difflib
 import hashlib
 import itertools
 import json
+import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +36,10 @@ class StudyConfig(BaseModel):
     options: dict[str, Any] = {}  # the same in all trials
     grid: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = {}  # every combination
     list: tuple[dict[str, Any], ...] = ()  # combinations one by one
-    seeds: Annotated[int, Field(ge=1)] | Annotated[tuple[int, ...], Field(min_length=1)] = 1
+    seeds: (
+        Annotated[int, Field(ge=1)]
+        | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    ) = 1
     threads: Annotated[int, Field(ge=1)] | Literal["all"] = 1  # of one trial
     seconds: Annotated[float, Field(gt=0)] | None = None  # that a trial takes, for --dry-run
 
@@ -109,6 +114,9 @@ def _override(content: dict[str, Any], setting: str) -> None:
         for group in held if isinstance(held, list) else [held]:
             if isinstance(group, dict):
                 group.pop(key, None)
+    if isinstance(content.get("list"), list):  # entries that differed in it alone are one now
+        listed = content["list"]
+        content["list"] = [one for k, one in enumerate(listed) if one not in listed[:k]]
     content.setdefault(part, {})
     if content[part] is None:
         content[part] = {}
@@ -143,12 +151,14 @@ def trials_of(config: StudyConfig) -> list[Trial]:
     missing.
     """
     study = study_of(config.study)
-    swept = list(_combinations(config))
-    if len(swept) * len(config.all_seeds) > MOST_TRIALS:
+    combinations = math.prod(map(len, config.grid.values())) * max(1, len(config.list))
+    seeds = config.seeds if isinstance(config.seeds, int) else len(config.seeds)
+    if combinations * seeds > MOST_TRIALS:
         raise CalibrationError(
-            f"{len(swept)} combinations x {len(config.all_seeds)} seeds are more than "
-            f"{MOST_TRIALS:,} trials: sweep less"
+            f"{combinations} combinations x {seeds} seeds are more than {MOST_TRIALS:,} trials: "
+            "sweep less"
         )
+    swept = list(_combinations(config))
     options = [_checked(study, config.options | one, one) for one in swept]
     digests: dict[Path, str] = {}
     hashed = [_inputs(study, one, digests) for one in options]
@@ -208,9 +218,21 @@ def content_digest(path: Path) -> str:
     if not path.is_dir():
         return sha256(path)
     digest = hashlib.sha256()
-    for file in sorted(p for p in path.rglob("*") if p.is_file()):
-        digest.update(f"{sha256(file)}  {file.relative_to(path).as_posix()}\n".encode())
+    for file in sorted(_files(path)):
+        digest.update(sha256(file).encode() + os.fsencode(file.relative_to(path)))
     return digest.hexdigest()
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """All files in it, in folders that are links too, those that lead back once."""
+    seen: set[str] = set()
+    for at, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(at)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        yield from (file for name in names if (file := Path(at, name)).is_file())
 
 
 def trial_key(
