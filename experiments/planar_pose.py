@@ -92,6 +92,7 @@ class Chosen:
     cam_from_board: Transforms  # (n,)
     n_left_out: int = 0
     n_misnumbered: int = 0
+    guessed: bool = False  # where the second camera stands, and it was said so
 
 
 # ---- what is seen --------------------------------------------------------------------------
@@ -119,6 +120,7 @@ def trial(options: PlanarOptions, seed: int) -> Row:
         "n_wrong": int(wrong.sum()),
         "n_left_out": chosen.n_left_out,
         "n_misnumbered": chosen.n_misnumbered,
+        "guessed": chosen.guessed,
         "predicted_wrong": float(norm.cdf(-np.sqrt(together) * distances / 2).mean()),
         "error_deg": float(np.degrees(np.sqrt((off**2).mean()))) if off.size else None,
     }
@@ -271,7 +273,8 @@ def by_target(seen: Seen, options: PlanarOptions, rng: np.random.Generator) -> C
         int((frame == each).sum() - np.bincount(turned[frame == each]).max())
         for each in np.unique(frame)
     )
-    return Chosen(kept, upright, len(start.dropped), misnumbered)
+    guessed = any(link.ambiguous for link in start.links)
+    return Chosen(kept, upright, len(start.dropped), misnumbered, guessed)
 
 
 def _turned_by(true: IntArray, found: IntArray, board: Board) -> int:

@@ -128,6 +128,8 @@ def _percent(case: Case) -> str:
 def _short(case: Case, usual: Any) -> str:
     left_out = 100 * case.total("n_left_out") / case.total("n_views")
     also = f" and {left_out:.0f} % left out" if left_out >= 1 else ""
+    if case.total("n_wrong") and case.total("guessed"):
+        also += f", said to be a guess in {100 * case.mean('guessed'):.0f} % of the rigs"
     return f"{_percent(case)}{also} ({_differs(case, usual)})"
 
 
@@ -150,7 +152,7 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
     columns = (
         "chosen by", "distance", "tilt deg", "noise px", "focal px", "corners", "apart deg",
         "frames", "roam deg", "trials", "failed", "views",
-        "wrong %", "±", "predicted %", "left out %",
+        "wrong %", "±", "predicted %", "said to be a guess %", "left out %",
         "misnumbered %", "error deg",
     )  # fmt: skip
     rows = []
@@ -159,7 +161,7 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
         used = case.total("n_used")
         numbers = (
             100 * share, 100 * error, 100 * case.mean("predicted_wrong"),
-            100 * case.total("n_left_out") / n_views,
+            100 * case.mean("guessed"), 100 * case.total("n_left_out") / n_views,
             100 * case.total("n_misnumbered") / max(used, 1), case.mean("error_deg"),
         )  # fmt: skip
         rows.append((

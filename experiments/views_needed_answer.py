@@ -14,8 +14,10 @@ from experiments.standard_errors import jackknifed, rms
 from graphs.frames import FloatArray
 
 SLOPE, SLOPE_TOLERANCE = -0.5, 0.1  # of log error over log n, for independent views
-FROM_VIEWS = 10  # with fewer, luck decides what the picture's corners see
+# With fewer, luck decides what the picture's corners see, or the scan has not gone round yet.
+FROM = {"board": 10, "scan": 20}
 MOST_OF_STATED = 1.4  # RMS error over RMS stated: beyond, sigmas hide how large it is
+MOST_NEES = MOST_OF_STATED**2
 STANDARD_ERRORS = 2.0
 FEWEST = 5  # trials of a case
 ADVICE = (20, 30)  # views
@@ -50,9 +52,17 @@ class Case:
         return jackknifed(lambda values: rms(values[:, 0]) / rms(values[:, 1]), both)
 
     @property
+    def nees(self) -> tuple[float, float]:
+        """Mean, and its standard error."""
+        return jackknifed(lambda values: float(values.mean()), self.column("nees"))
+
+    @property
     def told(self) -> bool:
-        ratio, error = self.of_stated
-        return ratio <= MOST_OF_STATED + STANDARD_ERRORS * error
+        """Whether neither the error over the picture nor that of the parameters is larger."""
+        return all(
+            value <= most + STANDARD_ERRORS * error
+            for (value, error), most in ((self.of_stated, MOST_OF_STATED), (self.nees, MOST_NEES))
+        )
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,7 @@ def answered(trials: Trials, usual: Any) -> Answer:
     holds = steep and not untold
     said = [
         f"error ~ n^{board.slope:.2f}±{board.slope_error:.2f} from {board.numbers[0]:g} to "
-        f"{board.numbers[1]:g} board views",
+        f"{board.numbers[1]:g} board views (stated: n^{stated_slope(cases, usual):.2f})",
         f"{board.at(ADVICE[0]):.2g} px at {ADVICE[0]}, {board.at(ADVICE[1]):.2g} px at "
         f"{ADVICE[1]} ({100 * (1 - board.at(ADVICE[1]) / board.at(ADVICE[0])):.0f} % less)",
         *worse(cases, usual),
@@ -96,14 +106,39 @@ def answered(trials: Trials, usual: Any) -> Answer:
             f"{equal} frames of a scan equal {ADVICE[0]} and {ADVICE[1]} views "
             f"(n^{scan.slope:.2f}±{scan.slope_error:.2f})"
         )
-    ratios = [case.of_stated[0] for case in judged]
-    if ratios:
+    if judged:
+        ratios, nees = ([part(c) for c in judged if c.told] for part in (_ratio, _nees))
         said.append(
-            f"errors are {min(ratios):.2f} to {max(ratios):.2f} of what is stated"
-            + (f", too large in {len(untold)} of {len(judged)} cases" if untold else "")
+            f"errors are {min(ratios):.2f} to {max(ratios):.2f} of what is stated, NEES "
+            f"{min(nees):.2f} to {max(nees):.2f}"
+            if ratios
+            else "stated covariances are too small"
         )
+    said += [
+        f"too small a covariance at {_differs(case, usual)}: {_ratio(case):.2f} of what is "
+        f"stated, NEES {_nees(case):.2g}"
+        for case in untold
+    ]
     verdict = ("yes: " if holds else "no: ") + "; ".join(said)
     return Answer(verdict, holds, tables, figures(cases, usual, board, scan))
+
+
+def _ratio(case: Case) -> float:
+    return case.of_stated[0]
+
+
+def _nees(case: Case) -> float:
+    return case.nees[0]
+
+
+def _differs(case: Case, usual: Any) -> str:
+    """Options in which a case is not the usual one, in a few words."""
+    words = [
+        f"{name} {getattr(case.options, name)}"
+        for name in type(usual).model_fields
+        if getattr(case.options, name) != getattr(usual, name)
+    ]
+    return ", ".join(words) or "the usual views"
 
 
 def cases_of(trials: Trials) -> list[Case]:
@@ -132,11 +167,11 @@ def varied(cases: Sequence[Case], usual: Any, option: str, **fixed: object) -> l
 
 
 def of_number(cases: Sequence[Case], usual: Any, source: str) -> list[Case]:
-    """Cases of a source from FROM_VIEWS on."""
+    """Cases of a source from FROM on."""
     return [
         case
         for case in varied(cases, usual, "views", source=source)
-        if case.options.views >= FROM_VIEWS
+        if case.options.views >= FROM[source]
     ]
 
 
@@ -153,6 +188,13 @@ def power_law(cases: Sequence[Case]) -> PowerLaw | None:
     level, slope = covariance @ design.T @ (np.log(error[:, 0]) / sigma)
     numbers = (some[0].options.views, some[-1].options.views)
     return PowerLaw(float(np.exp(level)), float(slope), float(np.sqrt(covariance[1, 1])), numbers)
+
+
+def stated_slope(cases: Sequence[Case], usual: Any) -> float:
+    """Of what is stated of board views: chance plays less of a part in it."""
+    some = of_number(cases, usual, "board")
+    stated = [rms(case.column("stated_px")) for case in some]
+    return float(np.polyfit(np.log([case.options.views for case in some]), np.log(stated), 1)[0])
 
 
 def worse(cases: Sequence[Case], usual: Any) -> list[str]:
@@ -182,15 +224,17 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
         "source", "number", "tilt deg", "coverage", "distance m", "printed", "trials",
         "failed", "off px", "±",
         "stated px", "off / stated", "± of it", "NEES", "± of NEES", "focal RMSE px",
-        "centre RMSE px", "picture seen",
+        "centre RMSE px", "picture seen", "warned %",
     )  # fmt: skip
     rows = []
     for case in cases:
-        o, nees = case.options, jackknifed(lambda v: float(v.mean()), case.column("nees"))
+        o = case.options
+        warned: list[Any] = [each.row["warned"] for each in case.trials]
+        warned = [each for each in warned if each is not None]
         numbers = (
-            *case.off_px, rms(case.column("stated_px")), *case.of_stated, *nees,
+            *case.off_px, rms(case.column("stated_px")), *case.of_stated, *case.nees,
             rms(case.column("focal_px")), rms(case.column("centre_px")),
-            float(case.column("seen").mean()),
+            float(case.column("seen").mean()), 100 * np.mean(warned) if warned else np.nan,
         )  # fmt: skip
         rows.append((
             o.source, o.views, o.tilt_deg, o.coverage, o.distance_m, o.printed,

@@ -1,7 +1,21 @@
-"""`python -m sfm_calib`."""
+"""What `sfm-calib` and `python -m sfm_calib` start; processes that they start load it too, so it is
+light."""
+
+from __future__ import annotations
 
 import sys
 
-from sfm_calib.cli import main
+EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
 
-sys.exit(main())
+
+def main() -> int:
+    """Load the command line, which takes seconds, and run it; the exit code."""
+    try:
+        from sfm_calib.cli import main as run
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -20,6 +20,7 @@ import tyro
 from pydantic import ValidationError
 
 import sfm_calib
+from sfm_calib.__main__ import EXIT_INTERRUPTED
 from sfm_calib.anchors import calibrate_with_board
 from sfm_calib.boards.load import load_board
 from sfm_calib.boards.page import write_board
@@ -64,7 +65,6 @@ EXIT_BAD_INPUT = 2
 ENTRY_POINTS = "sfm_calib.commands"
 DEMO_FRAMES = 24
 DEMO_FEATURES = 1500  # the room has 4000 an image: four times the matching, the same result
-EXIT_INTERRUPTED = 130  # as a shell says it of Ctrl-C
 
 
 def parse(argv: Sequence[str], config: RigConfig | None = None) -> Command:

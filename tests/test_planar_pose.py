@@ -76,7 +76,7 @@ def test_a_trial_is_the_same_again() -> None:
 def finished(n_wrong: int, predicted: float, **options: object) -> Finished[PlanarOptions]:
     row: Row = {
         "n_views": 200, "n_used": 200, "n_wrong": n_wrong, "n_left_out": 0, "n_misnumbered": 0,
-        "predicted_wrong": predicted, "error_deg": 1.0,
+        "predicted_wrong": predicted, "error_deg": 1.0, "guessed": False,
     }  # fmt: skip
     return Finished(PlanarOptions(**options), 0, row, 0.1)
 

@@ -14,12 +14,12 @@ NUMBERS = (3, 10, 20, 30, 60)
 
 
 def finished(
-    options: ViewsOptions, seed: int, off_px: float, stated_px: float
+    options: ViewsOptions, seed: int, off_px: float, stated_px: float, nees: float = 1.0
 ) -> Finished[ViewsOptions]:
     scale = 1 + 0.02 * (seed % 3 - 1)
     row = {
-        "off_px": off_px * scale, "stated_px": stated_px, "nees": 1.0, "focal_px": 1.0,
-        "centre_px": 1.0, "sigma_focal_px": 1.0, "seen": 0.9, "n_corners": 1000,
+        "off_px": off_px * scale, "stated_px": stated_px, "nees": nees, "focal_px": 1.0,
+        "centre_px": 1.0, "sigma_focal_px": 1.0, "seen": 0.9, "n_corners": 1000, "warned": False,
     }  # fmt: skip
     return Finished(options, seed, row, 1.0)
 
@@ -46,7 +46,12 @@ def test_other_laws_and_too_small_sigmas_do_not() -> None:
     assert answer(by_number(-1.2)).holds is False
     hidden = answer(by_number(-0.5, understated=3))
     assert hidden.holds is False
-    assert "too large in 5 of 5" in hidden.verdict
+    assert "stated covariances are too small" in hidden.verdict
+    assert hidden.verdict.count("3.0") >= len(NUMBERS)
+    flat = [finished(ViewsOptions(tilt_deg=0), seed, 1.0, 1.0, nees=30.0) for seed in range(6)]
+    narrow = answer([*by_number(-0.5), *flat])
+    assert narrow.holds is False
+    assert "at tilt_deg 0.0: 1.00 of what is stated, NEES 30" in narrow.verdict
 
 
 def test_a_scan_twice_as_bad_takes_four_times_the_frames() -> None:
