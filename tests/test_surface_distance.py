@@ -287,3 +287,21 @@ def test_whether_a_large_mesh_is_closed_takes_no_minutes() -> None:
     ball = Surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64))
     start = time.monotonic()
     assert ball.is_closed and time.monotonic() - start < 20
+
+
+@pytest.mark.parametrize("ascii_", [False, True])
+@pytest.mark.parametrize("cloud", [False, True])
+def test_a_truncated_ply_is_refused(tmp_path: Path, ascii_: bool, cloud: bool) -> None:
+    """Open3D would take the points that are missing to lie at the origin."""
+    path, mesh = tmp_path / "x.ply", open3d.geometry.TriangleMesh.create_sphere(0.1, 12)
+    if cloud:
+        points = open3d.geometry.PointCloud(mesh.vertices)
+        open3d.io.write_point_cloud(str(path), points, write_ascii=ascii_)
+    else:
+        open3d.io.write_triangle_mesh(str(path), mesh, write_ascii=ascii_)
+    assert len(load_surface(path).vertices) == len(mesh.vertices)
+    whole = path.read_bytes()
+    for share in (0.02, 0.3, 0.7, 0.98):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(CalibrationError, match="truncated"):
+            load_surface(path)

@@ -1,4 +1,4 @@
-"""PLY files: points or a mesh, with normals, colours and one number a vertex."""
+"""PLY files: points or a mesh, with normals, colours and one number a vertex; are they whole?"""
 
 from __future__ import annotations
 
@@ -11,6 +11,15 @@ from graphs.frames import FloatArray
 from graphs.problem import IntArray
 
 TYPES = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+SIZES = {
+    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
+    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8,
+    "float64": 8,
+}  # fmt: skip
+LEAST_IN_LIST = {
+    "vertex_indices": 3,
+    "vertex_index": 3,
+}  # a face's corners; other lists may be empty
 
 
 def ply(
@@ -48,3 +57,30 @@ def ply(
         faces["n"], faces["vertices"] = 3, triangles
         body += faces.tobytes()
     return "\n".join([*header, "end_header", ""]).encode() + body
+
+
+def is_whole(data: bytes) -> bool:
+    """Whether a PLY is as long as its header says, at least; True of any other file.
+
+    Open3D reads what there is of a truncated one, and leaves the rest of the points at zero.
+    """
+    head, ended, body = data.partition(b"end_header")
+    if not data.startswith(b"ply"):
+        return True
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    rows, length, count = 0, 0, 0
+    try:
+        for words in filter(None, lines):
+            if words[0] == "element":
+                count = int(words[2])
+                rows += count
+            elif words[:2] == ["property", "list"]:
+                least = LEAST_IN_LIST.get(words[4], 0)
+                length += count * (SIZES[words[2]] + least * SIZES[words[3]])
+            elif words[0] == "property":
+                length += count * SIZES[words[1]]
+    except (IndexError, KeyError, ValueError):
+        return False
+    if ["format", "ascii", "1.0"] in lines:
+        return bool(ended) and sum(1 for line in body.splitlines() if line.strip()) >= rows
+    return bool(ended) and len(body.removeprefix(b"\r").removeprefix(b"\n")) >= length

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from graphs.frames import FloatArray, Transform
 from graphs.problem import IntArray
+from sfm_calib.depth.ply import is_whole
 from sfm_calib.errors import CalibrationError
 from sfm_calib.open3d_import import import_open3d
 
@@ -121,6 +122,10 @@ def load_surface(path: Path, metres: float = 1.0) -> Surface:
     open3d = import_open3d(PURPOSE)
     if not path.is_file():
         raise CalibrationError(f"{path} is not there: give a file of a mesh or a cloud ({FORMATS})")
+    if path.suffix.lower() == ".ply" and not is_whole(path.read_bytes()):
+        raise CalibrationError(
+            f"{path} is shorter than its header says: it is truncated; copy it anew"
+        )
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         mesh = open3d.io.read_triangle_mesh(str(path))
         # STL, and seams of textures, repeat vertices: no edge would be shared.
