@@ -93,9 +93,9 @@ def test_what_is_said_of_distances() -> None:
 
 def test_samples_lie_evenly_on_a_mesh() -> None:
     points = box(1.0).sampled(60_000, 0)
-    assert len(points) == 60_008
+    assert len(points) == 60_000
     assert surface_distance(points, box(1.0)).unsigned.max() < 1e-6
-    faces = [np.isclose(points[8:, axis], side).sum() for axis in range(3) for side in (0, 1)]
+    faces = [np.isclose(points[:, axis], side).sum() for axis in range(3) for side in (0, 1)]
     assert faces == pytest.approx([10_000] * 6, abs=500)
     np.testing.assert_array_equal(points, box(1.0).sampled(60_000, 0))
 
@@ -256,6 +256,24 @@ def test_millimetres_and_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[st
     said = " ".join(capsys.readouterr().out.split())
     assert "a.xyz is a cloud" in said and "200 m large" not in said
     assert record(out)["a_to_b"]["max_m"] == pytest.approx(0.002, abs=1e-6)  # type: ignore[index]
+
+
+def test_where_a_mesh_is_finer_does_not_weigh_more(tmp_path: Path) -> None:
+    """A corner cut into a thousand triangles is still one corner, but its peak is the farthest."""
+    flat = sheet()
+    fan = np.linspace(0, np.pi / 2, 1001)
+    rim = flat.vertices[0] + 0.01 * np.stack([np.cos(fan), np.sin(fan), 0 * fan], axis=-1)
+    peak = flat.vertices[0] + np.array([0.0, 0.0, 0.5])
+    index = 4 + np.arange(1000)
+    more = np.stack([np.full(1000, 4 + 1001), index, index + 1], axis=-1)
+    a = Surface(
+        np.concatenate([flat.vertices, rim, peak[None]]), np.concatenate([flat.triangles, more])
+    )
+    places, out = (write(a, tmp_path / "a.ply"), write(flat, tmp_path / "b.ply")), tmp_path / "out"
+    assert main(["surface-distance", *map(str, places), "-o", str(out)]) == 0
+    found = record(out)["a_to_b"]
+    assert found["max_m"] == pytest.approx(0.5, abs=1e-6)  # type: ignore[index]
+    assert found["median_m"] < 1e-6 and found["mean_m"] < 0.002  # type: ignore[index]
 
 
 def test_what_only_one_side_has_can_be_left_out(tmp_path: Path) -> None:

@@ -88,6 +88,11 @@ def _check_whole(answered: Answered, path: Path) -> None:
             f"{record.trials.finished} of {record.trials.asked} trials of {record.study} are "
             "finished, and the index is for whole studies: finish the run first"
         )
+    if record.trials.broken:
+        raise CalibrationError(
+            f"{record.trials.broken} trials of {record.study} were broken off by the machine: run "
+            "it again, which does these anew"
+        )
     if not said.command:
         raise CalibrationError(
             f"the docstring of {record.study} does not say its command: add 'Run: sfm-calib run "

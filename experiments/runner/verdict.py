@@ -90,6 +90,9 @@ class Verdict(Record):
         return f"{self.said} {DASH} {self.verdict}"
 
 
+MOST_FAILED = 0.05  # of the finished trials: with more no expectation is met
+
+
 @dataclass(frozen=True)
 class Answered:
     """A study's answer with all that is said beside it."""
@@ -118,7 +121,9 @@ def answered(folder: Path) -> Answered:
         elsewhere=max(there - len(stored), 0),
     )
     origin = _origin(stored)
-    holds = None if answer.holds is None else bool(answer.holds)
+    # A study that refuses its hard part is no proof; one that counts refusals says no by itself.
+    proves = counts.failed <= MOST_FAILED * counts.finished or not answer.holds
+    holds = None if answer.holds is None or not proves else bool(answer.holds)
     record = Verdict(
         study=results.config.study,
         question=words.question,

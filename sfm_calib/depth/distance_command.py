@@ -12,7 +12,7 @@ import tyro
 from pydantic import Field
 
 import sfm_calib
-from graphs.frames import FloatArray, Transform
+from graphs.frames import Transform
 from sfm_calib.depth.surface import Surface, load_surface, painted
 from sfm_calib.depth.surface_distance import (
     Distances,
@@ -101,14 +101,14 @@ def run_surface_distance(command: SurfaceDistance, arguments: Sequence[str]) -> 
         a, b = (load_surface(path, command.metres_per_unit) for path in (command.a, command.b))
         progress("measuring", 0, 0)
         laid, a = _laid(a, b, command)
-        ways = (a.sampled(SAMPLES, SEED), b), (b.sampled(SAMPLES, SEED), a)
         (forth, left_forth), (back, left_back) = (
-            _cropped(points, surface_distance(points, of), command.crop) for points, of in ways
+            _cropped(surface_distance(one.sampled(SAMPLES, SEED), other), command.crop)
+            for one, other in ((a, b), (b, a))
         )
-        on_a = surface_distance(a.vertices, b).unsigned
+        on_a, on_b = (surface_distance(one.vertices, of).unsigned for one, of in ((a, b), (b, a)))
+        a_to_b, b_to_a = summary(forth, on_a, command.crop), summary(back, on_b, command.crop)
         record = DistanceRecord(
-            a_to_b=summary(forth), b_to_a=summary(back),
-            hausdorff_m=float(max(forth.unsigned.max(), back.unsigned.max())),
+            a_to_b=a_to_b, b_to_a=b_to_a, hausdorff_m=max(a_to_b.max_m, b_to_a.max_m),
             aligned=laid, left_out={"a_to_b": left_forth, "b_to_a": left_back},
             painted_to_m=command.paint_to or float(np.percentile(forth.unsigned, 95)),
             notes=tuple(_notes(a, b, command)), provenance=_provenance(command, arguments),
@@ -145,14 +145,14 @@ def _laid(a: Surface, b: Surface, command: SurfaceDistance) -> tuple[Laid | None
     return laid, a.moved(found.transform)
 
 
-def _cropped(points: FloatArray, found: Distances, crop: float | None) -> tuple[Distances, int]:
+def _cropped(found: Distances, crop: float | None) -> tuple[Distances, int]:
     """Those within reach, and how many are not."""
     if crop is None:
         return found, 0
     near = found.unsigned <= crop
     if not near.any():
         raise CalibrationError(
-            f"all {len(points)} points are farther than --crop {crop:g} m from the other surface, "
+            f"all {len(near)} points are farther than --crop {crop:g} m from the other surface, "
             f"the nearest {found.unsigned.min():.3g} m: crop less, or lay A on B (--align)"
         )
     signed = None if found.signed is None else found.signed[near]

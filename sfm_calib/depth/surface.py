@@ -95,8 +95,7 @@ class Surface:
         return within
 
     def sampled(self, count: int, seed: int) -> FloatArray:
-        """Points (k, 3) on it: of a mesh its vertices and `count` more, evenly by area; of a cloud
-        its own."""
+        """Points (k, 3) on it: of a mesh `count`, evenly by area; of a cloud its own."""
         if not self.is_mesh:
             return self.vertices
         rng = np.random.default_rng(seed)
@@ -106,8 +105,8 @@ class Surface:
         u, v = rng.random((2, count, 1))
         fold = u + v > 1
         u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
-        inner = a[which] + u * (b - a)[which] + v * (c - a)[which]
-        return np.concatenate([self.vertices[np.unique(self.triangles)], inner])
+        inner: FloatArray = a[which] + u * (b - a)[which] + v * (c - a)[which]
+        return inner
 
     def moved(self, transform: Transform) -> Surface:
         """The same elsewhere."""
