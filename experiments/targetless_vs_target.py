@@ -8,8 +8,8 @@ expects) as `sfm-calib target` does. Each is held against the truth: px rms over
 after the best rotation of each camera, focal length, and how the cameras sit. A scan equals the
 set of 25 views at the length from which on its px is no larger: those px that its covariance lets
 expect, rms over the seeds, for chance makes of the errors of some seeds what it likes. That errors
-are as stated is measured too, of boards and of scans. The scans' jackknife is left out: nothing errs
-in blocks of frames.
+are as stated is measured too, of boards and of scans. Of these the jackknife is left out: nothing
+errs in blocks of frames.
 Expectation: by the count of measurements, each weighed by its noise, 25 views of 54 corners are
 25 x 54 / 200 x (0.5 / 0.1)^2 = 169 images of 200 features, whatever the motion, to a factor of two.
 Source: the usual 20 to 30 images of a board (tutorials of OpenCV and MATLAB); the count is ours.
