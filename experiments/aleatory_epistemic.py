@@ -8,8 +8,10 @@ places that it never saw are measured REPEATS times with fresh noise, and means 
 against the truth, over many calibrations. The floor is what is measured without noise.
 Expectation: the mean square error is noise^2 / N + calibration^2, both as stated by the one
 calibration at hand with the noise that it estimated: RMSE over predicted as RMSE_RATIO has it at
-N = 1 and at the most, the NEES of the floor as FLOOR_NEES, within three standard errors; and
-averaging stops to pay at N* = noise^2 / calibration^2, as predicted to NSTAR_ROOM.
+N = 1 and at the most, the NEES of the floor as FLOOR_NEES, within three standard errors; averaging
+stops to pay at N* = noise^2 / calibration^2, as predicted to NSTAR_ROOM or to three standard
+errors, each and pooled over measures and ranges; and the noise that a scan estimates, from which
+both parts follow, is the true one to SIGMA_ROOM or three standard errors.
 Source: JCGM 100:2008 (GUM), 4.2.3 and F.1.1: repetition tells and reduces scatter alone; the names
 after Der Kiureghian and Ditlevsen, Aleatory or epistemic? Does it matter?, 2009.
 Run: sfm-calib run configs/studies/aleatory_epistemic.yaml -o out/aleatory_epistemic
@@ -26,12 +28,11 @@ from pydantic import Field
 
 from experiments.averaging import (
     MEASURES,
-    Curve,
     Measure,
-    curve_of,
     figures,
     in_words,
     judged,
+    kind_of,
     tables,
 )
 from experiments.runner.protocol import Answer, Finished, Row, Study, TrialOptions
@@ -180,16 +181,17 @@ def answer(trials: Sequence[Finished[AveragingOptions]]) -> Answer:
     done = [t for t in trials if t.error is None]
     if not done:
         return Answer("no trial was finished", None)
-    curves: list[Curve] = []
-    kinds = list(dict.fromkeys(t.options for t in done))
-    for options, name in zip(kinds, _names(kinds), strict=True):
-        rows = [t.row for t in done if t.options == options]
-        curves += [curve_of(name, measure, rows) for measure in MEASURES]
-    holds = judged(curves)
+    every = list(dict.fromkeys(t.options for t in done))
+    kinds = [
+        kind_of(name, options.sigma_px, [t.row for t in done if t.options == options])
+        for options, name in zip(every, _names(every), strict=True)
+    ]
+    holds = judged(kinds)
     word = {True: "yes", False: "no", None: "too few trials to say"}[holds]
     failed = len(trials) - len(done)
     lost = f"; {failed} of {len(trials)} trials failed" if failed else ""
-    return Answer(f"{word}: {in_words(curves)}{lost}", holds, tables(curves), figures(curves))
+    curves = [c for kind in kinds for c in kind.curves]
+    return Answer(f"{word}: {in_words(kinds)}{lost}", holds, tables(kinds), figures(curves))
 
 
 def _names(kinds: Sequence[AveragingOptions]) -> list[str]:

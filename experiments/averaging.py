@@ -12,6 +12,7 @@ from experiments.runner.figures import Series, lines
 from experiments.runner.protocol import AnswerFigure, AnswerTable, Row
 from experiments.scatter import (
     FEWEST,
+    STANDARD_ERRORS,
     Value,
     in_digits,
     mean_of,
@@ -20,6 +21,7 @@ from experiments.scatter import (
     stacked,
     within,
 )
+from experiments.standard_errors import jackknifed
 from graphs.frames import FloatArray
 
 Measure = Literal["depth", "point", "length"]
@@ -28,6 +30,7 @@ MEASURES: tuple[Measure, ...] = get_args(Measure)
 FLOOR_NEES = (0.9, 1.15)  # as `coverage` promises of the calibration
 RMSE_RATIO = (0.9**0.5, 1.15**0.5)
 NSTAR_ROOM = 1.15**2  # a factor either way: calibration by 15 %, noise by 15 %
+SIGMA_ROOM = 0.02  # of the noise: what is left of it in a sum of squares of some thousand residuals
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,45 @@ class Curve:
     nees: Value  # of the floor, over all ranges
     nstar: tuple[Value, ...]  # (r,) measured
     nstar_predicted: FloatArray  # (r,)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of rig and scan: its curves, and what they share."""
+
+    of: str
+    true_px: float  # noise of a coordinate
+    sigma_px: Value  # as its scans estimate it
+    nstar: Value  # measured over predicted, geometric mean over measures and ranges
+    curves: tuple[Curve, ...]
+
+
+def kind_of(of: str, true_px: float, rows: Sequence[Row]) -> Kind:
+    """The rows of one kind of rig together."""
+    curves = tuple(curve_of(of, measure, rows) for measure in MEASURES)
+    sigma_px = mean_of(stacked(rows, "sigma_px"))
+    return Kind(of, true_px, sigma_px, nstar_ratio(rows), curves)
+
+
+def nstar_ratio(rows: Sequence[Row]) -> Value:
+    """N* measured over predicted, as a geometric mean. Measures and ranges of a trial share its
+    calibration: its standard error is by leaving out whole trials."""
+    parts = []
+    for measure in MEASURES:
+        noise, calibration, floor = (
+            stacked(rows, f"{measure}_{key}") for key in ("noise", "calibration", "floor")
+        )  # (trials, r)
+        one = stacked(rows, f"{measure}_square").reshape(*floor.shape, -1)[..., 0]
+        parts.append(np.stack([one - floor, floor, noise, calibration], axis=1))
+    pooled = np.concatenate(parts, axis=2)  # (trials, 4, measures * r)
+
+    def geometric_mean(some: FloatArray) -> float:
+        drawn, floor, noise, calibration = some.mean(0).reshape(4, -1)
+        return float(np.exp(np.log(drawn / floor * calibration / noise).mean()))
+
+    with np.errstate(all="ignore"):  # noise that does not show beside the floor: no number
+        ratio, error = jackknifed(geometric_mean, pooled.reshape(len(rows), -1))
+    return ratio, error if len(rows) > 1 else None
 
 
 def curve_of(of: str, measure: Measure, rows: Sequence[Row]) -> Curve:
@@ -84,11 +126,40 @@ def curve_of(of: str, measure: Measure, rows: Sequence[Row]) -> Curve:
 # ---- the verdict ---------------------------------------------------------------------------
 
 
-def judged(curves: Sequence[Curve]) -> bool | None:
+def judged(kinds: Sequence[Kind]) -> bool | None:
     """Whether the split predicts what means do; None: of some there are too few trials to say."""
-    if any(c.trials < FEWEST for c in curves):
+    if any(c.trials < FEWEST for kind in kinds for c in kind.curves):
         return None
-    return not any(broken(c) for c in curves)
+    return not any(wrong_of(kind) for kind in kinds)
+
+
+def wrong_of(kind: Kind) -> list[str]:
+    """What of a kind is not as expected: its noise, its N* pooled, and each of its curves."""
+    said = []
+    if not noise_is_right(kind):
+        off = 100 * (kind.sigma_px[0] / kind.true_px - 1)
+        said.append(f"{noise_in_words(kind)}: {abs(off):.0f} % {'low' if off < 0 else 'high'}")
+    if not near(kind.nstar, 1.0, 1 / NSTAR_ROOM, NSTAR_ROOM):
+        said.append(f"N* {in_digits(kind.nstar)} times the predicted ({kind.of})")
+    wrong = [(c.measure, b) for c in kind.curves if (b := broken(c))]
+    return [*said, *(f"{measure} ({kind.of}): {', '.join(b)}" for measure, b in wrong)]
+
+
+def noise_is_right(kind: Kind) -> bool:
+    """Whether scans estimate the noise that there is."""
+    room = SIGMA_ROOM * kind.true_px
+    return near(kind.sigma_px, kind.true_px, kind.true_px - room, kind.true_px + room)
+
+
+def noise_in_words(kind: Kind) -> str:
+    """Estimated beside true, and the kind."""
+    return f"sigma_px {in_digits(kind.sigma_px, 3)} of {kind.true_px:.3f} at {kind.of}"
+
+
+def near(value: Value, expected: float, low: float, high: float) -> bool:
+    """Whether a value lies in the room about what is expected, or misses that by chance alone."""
+    by_chance = abs(value[0] - expected) <= STANDARD_ERRORS * (value[1] or 0.0)
+    return low <= value[0] <= high or by_chance
 
 
 def broken(curve: Curve) -> list[str]:
@@ -100,13 +171,14 @@ def broken(curve: Curve) -> list[str]:
     if not within(curve.nees, *FLOOR_NEES):
         said.append("NEES of the floor")
     for at, found, expected in zip(curve.ranges_m, curve.nstar, curve.nstar_predicted, strict=True):
-        if not within(found, expected / NSTAR_ROOM, expected * NSTAR_ROOM):
+        if not near(found, expected, expected / NSTAR_ROOM, expected * NSTAR_ROOM):
             said.append(f"N* at {at:g} m")
     return said
 
 
-def in_words(curves: Sequence[Curve]) -> str:
+def in_words(kinds: Sequence[Kind]) -> str:
     """The numbers that decide, in one line: depths at the middle range, and the worst of all."""
+    curves = [c for kind in kinds for c in kind.curves]
     most = f"{curves[0].counts[-1]:.0f}"
     said = []
     for c in curves:
@@ -123,7 +195,10 @@ def in_words(curves: Sequence[Curve]) -> str:
     for n, count in ((0, "one"), (-1, most)):
         said.append(f"RMSE over predicted {_range([c.ratio[n] for c in curves])} for {count}")
     said.append(f"NEES of the floor {_range([c.nees for c in curves])}")
-    wrong = [f"{c.measure} ({c.of}): {', '.join(b)}" for c in curves if (b := broken(c))]
+    each = ", ".join(f"{in_digits(kind.nstar)} ({kind.of})" for kind in kinds)
+    said.append(f"N* over predicted {each}")
+    said += [noise_in_words(kind) for kind in kinds if noise_is_right(kind)]
+    wrong = [one for kind in kinds for one in wrong_of(kind)]
     if wrong:
         said.append(f"not as predicted: {'; '.join(wrong)}")
     return "; ".join(said)
@@ -137,8 +212,10 @@ def _range(values: Sequence[Value]) -> str:
 # ---- tables and figures --------------------------------------------------------------------
 
 
-def tables(curves: Sequence[Curve]) -> tuple[AnswerTable, ...]:
-    """Where averaging ends, and errors of means."""
+def tables(kinds: Sequence[Kind]) -> tuple[AnswerTable, ...]:
+    """Where averaging ends, errors of means, and what the curves of a kind share."""
+    curves = [c for kind in kinds for c in kind.curves]
+    shared = tuple((k.of, k.true_px, *k.sigma_px, *k.nstar) for k in kinds)
     ends = [
         (
             c.of, c.measure, float(at), c.trials, 1e3 * float(c.noise_m[r]),
@@ -172,6 +249,10 @@ def tables(curves: Sequence[Curve]) -> tuple[AnswerTable, ...]:
             "means", "Errors of means",
             (*columns, "N", "RMSE (mm)", "predicted (mm)", "RMSE / predicted, all ranges", "±"),
             tuple(means),
+        ),
+        AnswerTable(
+            "noise", "The noise that scans estimate, and N* over all measures and ranges",
+            ("rig and scan", "noise (px)", "estimated (px)", "±", "N* / predicted", "±"), shared,
         ),
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from experiments.cabin_cases import (
     ADDED,
@@ -19,6 +20,7 @@ from experiments.cabin_cases import (
     Trials,
     by_case,
     cell,
+    common,
     is_lost,
     is_refused,
     is_swept,
@@ -36,6 +38,8 @@ PUBLISHED_FACTORY, PUBLISHED_CALIBRATED = (3.02, 3.84), (2.18, 2.95)  # mean, RM
 AS_GOOD = 1.1  # RMS with a scan and a board over that with boards, at most
 OFTEN = 0.5  # share of cabins whose places by hand do not register
 STANDARD_ERRORS = 3.0
+# Of a share's interval: of eight cabins three standard errors would leave even all of them open.
+CONFIDENCE = 0.95
 
 
 def answer(trials: Trials) -> Answer:
@@ -88,26 +92,29 @@ def fails_by_hand(cases: Cases) -> tuple[str, bool | None]:
     trials = cases[NOTHING]
     failed = sum(is_lost(one) for one in trials)
     words = f"from places by hand {failed} of {len(trials)} heads fail to register"
-    if len(trials) < FEWEST:
-        return words, None
-    share = failed / len(trials)
-    chance = (OFTEN * (1 - OFTEN) / len(trials)) ** 0.5
-    return words, share > OFTEN - chance
+    interval = stats.binomtest(failed, len(trials)).proportion_ci(CONFIDENCE)  # Clopper-Pearson
+    if len(trials) < FEWEST or interval.low < OFTEN < interval.high:
+        return f"{words} (too few cabins to say whether often)", None
+    return words, bool(interval.low >= OFTEN)
 
 
 def scan_for_boards(cases: Cases) -> tuple[str, bool | None]:
     """Whether a scan with one board does what boards do."""
     if BOARDS not in cases or ADDED not in cases:
         return "what a scan is worth is unsaid", None
-    boards, added = (mean(cases[name], "rms_mm")[0] for name in (BOARDS, ADDED))
+    of_boards, of_added = common(cases[BOARDS], cases[ADDED], "rms_mm")
+    boards, added = (mean(some, "rms_mm")[0] for some in (of_boards, of_added))
+    more, error = paired(of_added, of_boards, "rms_mm")
     words = f"a scan with one board reaches {added:.2f} mm"
     for name, what in ((SCAN, "with a tape"), (LOOSE, "without any length")):
         if name in cases:
             words += f", {what} {mean(cases[name], 'rms_mm')[0]:.2f}"
-    more, error = paired(cases[ADDED], cases[BOARDS], "rms_mm")
-    if not np.isfinite(error):
-        return words, None
-    return words, more - STANDARD_ERRORS * error <= (AS_GOOD - 1) * boards
+    room, chance = (AS_GOOD - 1) * boards, STANDARD_ERRORS * error
+    if more + chance <= room:
+        return words, True
+    if more - chance > room:
+        return words, False
+    return f"{words} (too few cabins to say whether as good)", None
 
 
 # ---- tables --------------------------------------------------------------------------------

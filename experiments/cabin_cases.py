@@ -85,6 +85,13 @@ def paired(trials: Trials, others: Trials, column: str) -> tuple[float, float]:
     return float(less.mean()), float(less.std(ddof=1) / len(less) ** 0.5)
 
 
+def common(trials: Trials, others: Trials, column: str) -> tuple[Trials, Trials]:
+    """Those of both whose cabin both measured."""
+    seeds = [{t.seed for t in some if np.isfinite(number(t, column))} for some in (trials, others)]
+    both = seeds[0] & seeds[1]
+    return [one for one in trials if one.seed in both], [one for one in others if one.seed in both]
+
+
 def share(trials: Trials, is_so: Callable[[Finished[CabinOptions]], bool]) -> float:
     """Of the trials of which something is so."""
     return float(np.mean([is_so(one) for one in trials]))

@@ -49,6 +49,7 @@ class Group:
     ratio_at: tuple[Value, ...]  # the same point by point
     of_closed: float | None  # propagated over the textbook's, mean
     total: Value | tuple[None, None]  # of scans: RMS of z with the pixels' noise
+    bias: float  # mean error over the RMS, where it is most
 
     @property
     def said(self) -> str:
@@ -77,6 +78,7 @@ def group_of(effect: Effect | Literal["scan"], shape: LensShape, rows: Sequence[
         tuple(root_of(column) for column in square.T),
         None if scan else float((propagated / stacked(rows, "closed_m")).mean()),
         root_of(stacked(rows, "z_square_total").mean(1)) if scan else (None, None),
+        float(np.abs((stacked(rows, "bias_m") / rms).mean(0)).max()),
     )
 
 

@@ -136,12 +136,12 @@ def _overview(groups: Sequence[Group]) -> AnswerTable:
     columns = (
         "effect", "lens", "trials", "law", "expected exponent", "exponent", "±",
         "propagated exponent", "Monte Carlo / propagated", "±", "propagated / textbook",
-        "z RMS with noise", "±",
+        "z RMS with noise", "±", "bias / RMS, at most",
     )  # fmt: skip
     rows = [
         (
             g.effect, g.shape, g.trials, g.said, g.expected, *g.exponent, g.exponent_propagated,
-            *g.ratio, g.of_closed, *g.total,
+            *g.ratio, g.of_closed, *g.total, g.bias,
         )
         for g in groups
     ]  # fmt: skip

@@ -17,6 +17,9 @@ Change = Literal["none", "turned", "focal", "baseline", "weak", "weak turned", "
 UNTOUCHED: tuple[Change, ...] = ("none", "weak", "panorama")
 TOO_WEAK: tuple[Change, ...] = ("weak", "weak turned", "panorama")
 
+FINDABLE: tuple[Change, ...] = ("turned", "focal")  # of three or more cameras: meant to be found
+LEAST_ALLOWED = 0.5  # of their trials: where sigmas allow fewer, nothing is said of what is found
+
 LEVEL, POWER = 0.05, 0.95  # wrongly replaced at most; found at least, where sigmas allow it
 LEAST_CHANCE = 0.00135  # of what is seen, were it as expected: three standard errors
 FEWEST_TRIALS = 5  # of a case: of fewer even all of them say little
@@ -92,6 +95,21 @@ def broken(one: Summary) -> list[str]:
     if one.cameras > 2 and too_many(one.nameable - one.named_nameable, one.nameable):
         found.append(f"the camera named in {one.named_nameable} of {one.nameable}")
     return found
+
+
+def broken_together(summaries: Sequence[Summary]) -> list[str]:
+    """What of all rigs together is not as expected, though each alone may be by chance."""
+    some = [one for one in summaries if one.change == "none"]
+    replace, trials = (sum(getattr(one, name) for one in some) for name in ("replace", "trials"))
+    if len(some) > 1 and too_many(replace, trials):
+        return [f"{replace} of {trials} untouched rigs replaced"]
+    return []
+
+
+def too_little_allowed(summaries: Sequence[Summary]) -> bool:
+    """Whether sigmas allow so little of what is meant to be found that finding it says nothing."""
+    some = [one for one in summaries if one.change in FINDABLE and one.cameras > 2]
+    return sum(one.allowed for one in some) < LEAST_ALLOWED * sum(one.trials for one in some)
 
 
 def too_many(wrong: int, of: int) -> bool:

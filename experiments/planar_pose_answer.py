@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments.runner.figures import Series, lines
 from experiments.runner.protocol import Answer, AnswerFigure, AnswerTable, Finished
+from experiments.scatter import ratio_of
 
 # Measured and predicted shares agree within this and three standard errors: the prediction is of
 # second order, and solutions of small tilts lie near each other.
@@ -32,7 +33,8 @@ NAMES = {
     "target": "target, one camera",
 }
 # Views that are judged together; of a sequence, its frames.
-TOGETHER = {"lone": 1, "target": 1, "known_rig": 2, "votes": 2, "half_turns": 2}
+TOGETHER = {"lone": 1, "target": 1, "known_rig": 2}
+LINKED = ("votes", "half_turns")  # a trial decides once where its second camera stands
 Trials = Sequence[Finished[Any]]
 
 
@@ -55,10 +57,18 @@ class Case:
         if not used:
             return float("nan"), float("inf")
         share = self.total("n_wrong") / used
-        # Views that are judged together err together. Of none wrong the error is not zero.
-        n = used / TOGETHER.get(self.options.how, self.options.frames)
-        guarded = (share * n + 1) / (n + 2)
-        return share, float(np.sqrt(guarded * (1 - guarded) / n))
+        if self.options.how in LINKED:
+            return share, self._scatter(share)
+        # Views that are judged together err together.
+        return share, _guarded(share, used / TOGETHER.get(self.options.how, self.options.frames))
+
+    def _scatter(self, share: float) -> float:
+        """Standard error by the scatter of the trials, infinite of one."""
+        counts: list[Any] = [[one.row["n_wrong"], one.row["n_used"]] for one in self.trials]
+        own = np.array([pair for pair in counts if pair[1]], dtype=float)
+        if len(own) < 2:
+            return float("inf")
+        return ratio_of(own)[1] or _guarded(share, len(own))
 
     def mean(self, name: str) -> float:
         values: list[Any] = [each.row[name] for each in self.trials]
@@ -70,6 +80,20 @@ class Case:
         share, error = self.wrong
         off = abs(share - self.mean("predicted_wrong"))
         return bool(off <= CLOSE_ENOUGH + STANDARD_ERRORS * error)
+
+    @property
+    def resolved(self) -> bool | None:
+        """Whether as few are wrong as with a second camera should be; None: more, by chance."""
+        share, error = self.wrong
+        if share > RESOLVED + STANDARD_ERRORS * error:
+            return False
+        return True if share <= RESOLVED and np.isfinite(error) else None
+
+
+def _guarded(share: float, n: float) -> float:
+    """Binomial standard error of a share of n, not zero where none or all of them are wrong."""
+    guarded = (share * n + 1) / (n + 2)
+    return float(np.sqrt(guarded * (1 - guarded) / n))
 
 
 def answered(trials: Trials, usual: Any) -> Answer:
@@ -84,7 +108,7 @@ def answered(trials: Trials, usual: Any) -> Answer:
         for case in cases
         if case.options.how in ("known_rig", "votes") and case.options.apart_deg >= RESOLVED_DEG
     ]
-    unresolved = [case for case in pairs if case.wrong[0] > RESOLVED]
+    resolved = [case.resolved for case in pairs]
     said = [f"{len(lone) - len(odd)} of {len(lone)} cases of lone views as predicted"]
     if lone:
         farthest = max(lone, key=lambda case: abs(case.wrong[0] - case.mean("predicted_wrong")))
@@ -101,10 +125,9 @@ def answered(trials: Trials, usual: Any) -> Answer:
     tables = (cases_table(cases),)
     if not lone or not pairs:
         return Answer("; ".join(said), None, tables, figures(cases, usual))
-    holds = not odd and not unresolved
-    return Answer(
-        ("yes: " if holds else "no: ") + "; ".join(said), holds, tables, figures(cases, usual)
-    )
+    holds = False if odd or False in resolved else None if None in resolved else True
+    word = {True: "yes", False: "no", None: "too few trials to say"}[holds]
+    return Answer(f"{word}: {'; '.join(said)}", holds, tables, figures(cases, usual))
 
 
 def cases_of(trials: Trials) -> list[Case]:
@@ -122,7 +145,10 @@ def cases_of(trials: Trials) -> list[Case]:
 
 def _percent(case: Case) -> str:
     share, error = case.wrong
-    return f"{100 * share:.1f}±{100 * error:.1f} %" if np.isfinite(share) else "none used"
+    if not np.isfinite(share):
+        return "none used"
+    bar = f"±{100 * error:.1f}" if np.isfinite(error) else ""
+    return f"{100 * share:.1f}{bar} %"
 
 
 def _short(case: Case, usual: Any) -> str:

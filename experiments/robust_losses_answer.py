@@ -143,8 +143,12 @@ def costs(groups: Sequence[Group]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def regrets(groups: Sequence[Group], loss: str) -> list[tuple[float, float, str, Group]]:
-    """Errors over those of the best loss, their standard error, that loss; the surest first.
+Regret = tuple[float, float, str, Group]
+
+
+def rivals(groups: Sequence[Group], loss: str) -> list[list[Regret]]:
+    """Errors over those of each other loss, their standard error, that loss; condition by
+    condition.
 
     In the library's way; of losses that broke no more often, in the scans that both got right.
     """
@@ -153,10 +157,20 @@ def regrets(groups: Sequence[Group], loss: str) -> list[tuple[float, float, str,
         if own.loss != loss or own.of("way") != "library":
             continue
         others = [g for g in groups if g.condition == own.condition and g.broken <= own.broken]
-        over = [(*r, g.loss) for g in others if g is not own and (r := ratio(own, g))]
+        over = [(*r, g.loss, own) for g in others if g is not own and (r := ratio(own, g))]
         if over:
-            found.append((*max(over), own))
-    return sorted(found, key=lambda one: STANDARD_ERRORS * one[1] - one[0])
+            found.append(over)
+    return found
+
+
+def regrets(groups: Sequence[Group], loss: str) -> list[Regret]:
+    """Of each condition the rival that is better most surely; the surest condition first."""
+
+    def surely(one: Regret) -> float:
+        return one[0] - STANDARD_ERRORS * one[1]
+
+    surest = [max(over, key=surely) for over in rivals(groups, loss)]
+    return sorted(surest, key=surely, reverse=True)
 
 
 def breaks_from(groups: Sequence[Group], loss: str, way: str) -> tuple[float | None, float] | None:
@@ -236,8 +250,9 @@ def _of_default(groups: Sequence[Group]) -> str:
 
 def _worst(groups: Sequence[Group], loss: str) -> float | None:
     """Errors over those of the best loss where outliers are few enough, at worst."""
-    over = [r[0] for r in regrets(groups, loss) if r[3].of("outlier_share") <= MOST_OUTLIERS]
-    return max(over, default=None)
+    every = [r for over in rivals(groups, loss) for r in over]
+    few = [r[0] for r in every if r[3].of("outlier_share") <= MOST_OUTLIERS]
+    return max(few, default=None)
 
 
 def _of_regret(groups: Sequence[Group]) -> str:

@@ -8,7 +8,8 @@ expects) as `sfm-calib target` does. Each is held against the truth: px rms over
 after the best rotation of each camera, focal length, and how the cameras sit. A scan equals the
 set of 25 views at the length from which on its px is no larger: those px that its covariance lets
 expect, rms over the seeds, for chance makes of the errors of some seeds what it likes. That errors
-are as stated is measured too. Of scans the jackknife is left out: nothing errs in blocks of frames.
+are as stated is measured too, of boards and of scans. Of these the jackknife is left out: nothing
+errs in blocks of frames.
 Expectation: by the count of measurements, each weighed by its noise, 25 views of 54 corners are
 25 x 54 / 200 x (0.5 / 0.1)^2 = 169 images of 200 features, whatever the motion, to a factor of two.
 Source: the usual 20 to 30 images of a board (tutorials of OpenCV and MATLAB); the count is ours.
@@ -104,9 +105,17 @@ class Equalled:
     by_errors: Equal  # in px
 
     @property
-    def as_counted(self) -> bool:
+    def as_counted(self) -> bool | None:
+        """None: the scans tried are too short to be as counted, and do not equal the set either.
+
+        One that equals it at no length tried may at any longer one.
+        """
         low, high = self.px.interval
-        return low <= FACTOR * self.kind.counted and high >= self.kind.counted / FACTOR
+        if high < self.kind.counted / FACTOR:
+            return False
+        if self.px.longest < self.kind.counted / FACTOR:
+            return None
+        return min(low, self.px.longest) <= FACTOR * self.kind.counted
 
 
 def answer(trials: Some) -> Answer:
@@ -121,23 +130,35 @@ def answer(trials: Some) -> Answer:
     if not alone:
         what = f"no scan and set of {SET_VIEWS} board views among {len(trials)} trials"
         return Answer(f"too little to say: {what} went well", None, tuple(tables))
-    ratio, chance = errors_over_stated(kinds)
+    errors = errors_over_stated(kinds)
     few = min(kind.fewest for kind in kinds) < FEWEST_SEEDS
-    untold = not AS_STATED[0] < ratio < AS_STATED[1]
-    holds = None if few or untold else all(one.as_counted for one in alone)
-    begin = "yes" if holds else "no"
+    untold = any(not AS_STATED[0] < ratio < AS_STATED[1] for ratio, _ in errors.values())
+    told = [said for one in alone if (said := one.as_counted) is not None]
+    holds = None if few or untold or not told else all(told)
+    begin = {True: "yes", False: "no", None: "scans are too short to say"}[holds]
     if few or untold:
         begin = "too few seeds to say" if few else "errors are not as stated"
+    beside = " and ".join(
+        f"{ratio:.2f} ± {chance:.2f} (of {what})" for what, (ratio, chance) in errors.items()
+    )
     return Answer(
-        f"{begin}: {in_words(alone, found, kinds)}; errors are {ratio:.2f} ± {chance:.2f} times as "
-        "stated",
+        f"{begin}: {in_words(alone, found, kinds)}; errors are {beside} times as stated",
         holds,
         (equal_table(found), *tables),
         figures(kinds),
     )
 
 
-def errors_over_stated(kinds: Sequence[Kind]) -> tuple[float, float]:
+def errors_over_stated(kinds: Sequence[Kind]) -> dict[str, tuple[float, float]]:
+    """Of boards alone and of scans, for a level is of the one and a length of the other."""
+    of_sources = {
+        "boards": [kind for kind in kinds if kind.options.source == "boards"],
+        "scans": [kind for kind in kinds if kind.options.source == "scan"],
+    }
+    return {name: _over_stated(some) for name, some in of_sources.items() if some}
+
+
+def _over_stated(kinds: Sequence[Kind]) -> tuple[float, float]:
     """Of px, rms over all trials, and its standard error: trials of one seed go together."""
     squares: dict[int, list[float]] = {}
     for kind in kinds:

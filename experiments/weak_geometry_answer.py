@@ -48,7 +48,8 @@ class Standing:
     """How one solver fared with no belief in the lens."""
 
     solver: str
-    fails_from: tuple[float, ...]  # condition of the first trial not right, a motion and lens each
+    # Condition of the first trial not right, a motion and lens each; inf: all judged are right.
+    fails_from: tuple[float, ...]
     power: float | None  # of the condition, that errors grow as
     trials: int
     refused: int
@@ -58,8 +59,13 @@ class Standing:
 
     @property
     def typical(self) -> float | None:
-        """The condition from which it fails, the median of all motions."""
+        """The condition from which it fails, the median of all motions; inf: most never do."""
         return statistics.median(self.fails_from) if self.fails_from else None
+
+    @property
+    def failing(self) -> list[float]:
+        """Conditions of the motions in which it fails at all."""
+        return [condition for condition in self.fails_from if np.isfinite(condition)]
 
 
 def answer(trials: Sequence[Finished[Any]]) -> Answer:
@@ -73,7 +79,7 @@ def answer(trials: Sequence[Finished[Any]]) -> Answer:
     unsaid = [t for t in calibrated if goes_unsaid(t.row)]
     reached = max((t.row["condition"] for t in judged), default=0.0)
     holds = _holds(standings, reached, calibrated, unsaid)
-    word = {True: "yes", False: "no", None: "too few trials to say"}[holds]
+    word = {True: "yes", False: "no", None: "too little to say"}[holds]
     failed = len(trials) - len(done)
     words = [*_in_words(standings), _of_calibrations(calibrated, unsaid)]
     said = "; ".join(one for one in words if one) + (f"; {failed} trials failed" if failed else "")
@@ -92,8 +98,7 @@ def standing(solver: str, judged: Trials) -> Standing:
     fails = []
     for _, some in _cases(judged):
         lost = [t.row["condition"] for t in some if not right(t.row, solver)]
-        if lost:
-            fails.append(min(lost))
+        fails.append(min(lost, default=float("inf")))
     rows = [t.row for t in judged]
     refused = [row for row in rows if row[f"{solver}_sigma_error"] is None]
     wrong = [row for row in rows if (row[f"{solver}_sigma_error"] or 0.0) > WRONG]
@@ -143,10 +148,12 @@ def _holds(
     kept: list[bool | None] = []
     for solver, lost in LOST.items():
         found, p = of[solver].typical, of[solver].power
-        if found is not None:
-            kept.append(bool(abs(np.log10(found / lost)) <= DECADES))
+        # What fails beyond the judge's own condition is not seen to.
+        least, most = lost / 10**DECADES, min(lost * 10**DECADES, JUDGED)
+        if found is not None and np.isfinite(found):
+            kept.append(bool(least <= found <= most))
         else:
-            kept.append(False if reached > lost * 10**DECADES else None)
+            kept.append(False if reached > most else None)
         kept.append(None if p is None else abs(p - GROWS[solver]) <= POWER_WITHIN)
     kept.append(of["ours"].silent == 0 if of["ours"].trials else None)
     kept.append(not unsaid if calibrated else None)
@@ -159,13 +166,16 @@ def _in_words(standings: Sequence[Standing]) -> Iterator[str]:
     for one in standings:
         if one.solver == "unchecked" or not one.trials:
             continue
-        if one.typical is None:
+        if not one.failing or one.typical is None:
             yield f"{TITLES[one.solver]} was right in all {one.trials}"
             continue
         grows = "" if one.power is None else f"error as cond^{one.power:.1f}, "
         usable = f", {one.silent} called usable" if one.wrong and one.solver == "ours" else ""
+        at = one.typical if np.isfinite(one.typical) else min(one.failing)
+        n, some = len(one.failing), f"in {len(one.failing)} of {len(one.fails_from)} cases "
         yield (
-            f"{TITLES[one.solver]} fails from cond(J) {one.typical:.0e} ({grows}"
+            f"{TITLES[one.solver]} fails {'' if n == len(one.fails_from) else some}"
+            f"from cond(J) {at:.0e} ({grows}"
             f"{one.refused} refused, {one.wrong} wrong{usable})"
         )
 
@@ -187,15 +197,16 @@ def _of_calibrations(calibrated: Trials, unsaid: Trials) -> str:
 def _solvers(standings: Sequence[Standing]) -> AnswerTable:
     rows = tuple(
         (
-            TITLES[one.solver], one.typical, min(one.fails_from, default=None),
-            max(one.fails_from, default=None), one.power, one.trials, one.refused, one.needless,
-            one.wrong, one.silent,
+            TITLES[one.solver],
+            one.typical if one.typical is not None and np.isfinite(one.typical) else None,
+            min(one.failing, default=None), max(one.failing, default=None), one.power, one.trials,
+            one.refused, one.needless, one.wrong, one.silent, len(one.failing), len(one.fails_from),
         )
         for one in standings
     )  # fmt: skip
     columns = (
         "solver", "fails from cond(J)", "least", "most", "error as cond^", "trials", "refused",
-        "though usable", "wrong", "called usable",
+        "though usable", "wrong", "called usable", "motions and lenses in which it fails", "of",
     )  # fmt: skip
     return AnswerTable("solvers", "No belief in the lens", columns, rows)
 

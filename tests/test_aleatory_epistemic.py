@@ -16,7 +16,7 @@ from experiments.aleatory_epistemic import (
     squares_of_means,
     trial,
 )
-from experiments.averaging import MEASURES, curve_of
+from experiments.averaging import MEASURES, broken, curve_of, kind_of, near, wrong_of
 from experiments.runner.protocol import Answer, Finished, Row
 from experiments.stereo import as_estimate, parallel_pair, points_at, seen_by_both
 from graphs.compare import Stated
@@ -86,9 +86,16 @@ def test_trials_are_functions_of_their_seed() -> None:
 # ---- answers -------------------------------------------------------------------------------
 
 
-def made_row(rng: np.random.Generator, noise: float = 1.0, calibration: float = 1.0) -> Row:
-    """A trial of known sigmas, of which noise and calibration are stated as so much of them."""
-    row: dict[str, list[float]] = {"range_m": list(RANGES_M), "n": [float(n) for n in COUNTS]}
+def made_row(
+    rng: np.random.Generator, noise: float = 1.0, calibration: float = 1.0, sigma: float = 1.0
+) -> Row:
+    """A trial of known sigmas, of which noise and calibration are stated as so much of them, and
+    the pixels' noise estimated."""
+    row: dict[str, list[float] | float] = {
+        "range_m": list(RANGES_M),
+        "n": [float(n) for n in COUNTS],
+        "sigma_px": SIGMA_PX * sigma * rng.normal(1, 0.01),
+    }
     counts = np.array(COUNTS)
     for measure in MEASURES:
         of_noise, of_calibration = 0.01 * np.array(RANGES_M) ** 2, 0.002 * np.array(RANGES_M)
@@ -103,12 +110,17 @@ def made_row(rng: np.random.Generator, noise: float = 1.0, calibration: float = 
 
 
 def answered(
-    noise: float = 1.0, calibration: float = 1.0, frames: tuple[int, ...] = (40,)
+    noise: float = 1.0,
+    calibration: float = 1.0,
+    frames: tuple[int, ...] = (40,),
+    sigma: float = 1.0,
 ) -> Answer:
     rng = np.random.default_rng(0)
     return answer(
         [
-            Finished(AveragingOptions(frames=f), seed, made_row(rng, noise, calibration), 1.0)
+            Finished(
+                AveragingOptions(frames=f), seed, made_row(rng, noise, calibration, sigma), 1.0
+            )
             for f in frames
             for seed in range(50)
         ]
@@ -121,7 +133,7 @@ def test_a_split_that_holds() -> None:
     # at 2 m, noise 40 mm and calibration 4 mm: N* = 100
     assert "frames 40: 1000 measurements of a depth of 2 m leave 4" in found.verdict
     assert "(predicted 100)" in found.verdict
-    assert [table.name for table in found.tables] == ["ends", "means"]
+    assert [table.name for table in found.tables] == ["ends", "means", "noise"]
     assert [f.name for f in found.figures] == [*MEASURES, "ratio"]
 
 
@@ -143,7 +155,48 @@ def test_the_curve_by_hand() -> None:
 def test_answers_flip_when_the_data_are_wrong(noise: float, calibration: float, wrong: str) -> None:
     found = answered(noise, calibration)
     assert found.holds is False and found.verdict.startswith("no: ")
-    assert wrong in found.verdict.split("not as predicted: depth")[1]
+    assert "not as predicted: " in found.verdict
+    assert wrong in found.verdict.split("depth (frames 40): ")[1]
+
+
+@pytest.mark.parametrize(("sigma", "side"), [(0.92, "8 % low"), (1.03, "3 % high")])
+def test_noise_that_is_estimated_wrong_is_said_though_the_sums_hold(
+    sigma: float, side: str
+) -> None:
+    assert answered(sigma=0.99).holds is True  # within the room
+    found = answered(sigma=sigma)
+    assert found.holds is False
+    assert f"sigma_px {SIGMA_PX * sigma:.3f} ± 0.000 of 0.300 at frames 40: {side}" in found.verdict
+
+
+def test_nstar_pooled_tells_what_no_range_tells_alone() -> None:
+    """Twice as much as predicted at a scatter that leaves each range open."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(30):
+        row = dict(made_row(rng))
+        for measure in MEASURES:
+            luck = rng.chisquare(1.5, len(RANGES_M)) / 1.5
+            for key in ("floor", "nees"):
+                row[f"{measure}_{key}"] = (0.6 * luck * np.ones(3)).tolist()
+            floor = np.array(row[f"{measure}_floor"]) * 1e-4
+            noise = 1e-2 * np.ones((3, 1)) / np.array(COUNTS)
+            row[f"{measure}_floor"] = floor.tolist()
+            row[f"{measure}_square"] = (noise + floor[:, None]).ravel().tolist()
+            row[f"{measure}_noise"] = [1e-2] * 3
+            row[f"{measure}_calibration"] = [1.1e-4] * 3
+        rows.append(row)
+    found = kind_of("", SIGMA_PX, rows)
+    ratio, error = found.nstar
+    assert 1.5 < ratio < 2.5 and error is not None and 0.05 < error < 0.25
+    assert not any("N* at" in one for c in found.curves for one in broken(c))
+    assert any("times the predicted" in one for one in wrong_of(found))
+
+
+def test_room_and_chance_are_not_added() -> None:
+    """Either is enough; both together are not: 1.2 misses by the room and two errors."""
+    assert near((1.09, 0.0), 1.0, 0.9, 1.1) and near((1.2, 0.07), 1.0, 0.9, 1.1)
+    assert not near((1.2, 0.05), 1.0, 0.9, 1.1) and not near((float("nan"), 0.1), 1.0, 0.9, 1.1)
 
 
 def test_few_and_failed_trials() -> None:

@@ -8,8 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 import sfm_calib.simulate.depth_image as depth_images
+from experiments.cabin_answer import fails_by_hand, scan_for_boards
 from experiments.cabin_calibration import CabinOptions, calibrate_cabin, show_board
-from experiments.cabin_cases import BOARDS, NOTHING, by_case, case_of, mean, paired
+from experiments.cabin_cases import ADDED, BOARDS, NOTHING, by_case, case_of, mean, paired
 from experiments.cabin_model import misplaced_mm, model_row, taken
 from experiments.depth_camera_cabin import STUDY, answer, trial
 from experiments.runner.protocol import Finished
@@ -91,6 +92,46 @@ def test_what_does_not_hold_turns_the_verdict(case: str, numbers: tuple[float, f
     result = answer(made_up(**{case: numbers}))
     assert result.holds is False
     assert not result.verdict.startswith("yes")
+
+
+def scattered(case: str, scatter: float) -> list[Finished[CabinOptions]]:
+    """RMS of one case up and down by so much, cabin by cabin; 0 on average."""
+    return [
+        replace(one, row={**one.row, "rms_mm": one.row["rms_mm"] + scatter * (-1) ** one.seed})
+        if case_of(one.options) == case
+        else one
+        for one in made_up()
+    ]
+
+
+def test_what_scatters_too_much_is_neither_as_good_nor_worse() -> None:
+    assert scan_for_boards(by_case(scattered(ADDED, 0.03)))[1] is True
+    words, holds = scan_for_boards(by_case(scattered(ADDED, 0.4)))
+    assert holds is None and "too few cabins to say whether as good" in words
+    assert answer(scattered(ADDED, 0.4)).holds is None
+    assert scan_for_boards(by_case(made_up(**{ADDED: (1.5, 0.8)})))[1] is False
+
+
+def test_a_scan_and_boards_are_compared_in_the_cabins_that_both_have() -> None:
+    """Of boards there is one cabin more, in which they fare ill."""
+    trials = made_up()
+    ill = next(one for one in trials if case_of(one.options) == BOARDS)
+    more = replace(ill, seed=100, row={**ill.row, "rms_mm": 40.0})
+    worse = made_up(**{ADDED: (1.5, 0.8)})
+    assert scan_for_boards(by_case([*worse, more]))[1] is False
+    assert scan_for_boards(by_case([*worse, more])) == scan_for_boards(by_case(worse))
+
+
+@pytest.mark.parametrize(
+    ("failed", "of", "often"), [(8, 8, True), (6, 8, None), (3, 8, None), (0, 8, False)]
+)
+def test_often_is_more_than_half_beyond_chance(failed: int, of: int, often: bool | None) -> None:
+    options = CabinOptions.model_validate(UNCALIBRATED)
+    trials = [
+        Finished(options, seed, {"registered_misplaced_mm": 25.0 if seed < failed else 1.0}, 1.0)
+        for seed in range(of)
+    ]
+    assert fails_by_hand(by_case(trials))[1] is often
 
 
 @pytest.mark.parametrize("seeds", [0, 1, 3])

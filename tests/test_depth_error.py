@@ -168,6 +168,17 @@ def test_a_law_that_holds() -> None:
     assert [f.name for f in found.figures] == ["depth", "radius", "scan_depth", "scan_z"]
     row = found.tables[0].rows[0]
     assert row[0] == "pixels" and row[4] == 2 and row[5] == pytest.approx(2.0)
+    assert row[-1] == 0
+
+
+def test_a_bias_is_told() -> None:
+    """Half of the RMS at the one point where it is most."""
+    rng = np.random.default_rng(0)
+    row = dict(law_row("pixels", rng))
+    bias = 0.1 * np.array(row["rms_m"])
+    bias[3] *= -5
+    trials = [Finished(DepthOptions(effect="pixels"), 0, row | {"bias_m": bias.tolist()}, 1.0)]
+    assert answer(trials).tables[0].rows[0][-1] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(

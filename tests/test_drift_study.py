@@ -98,6 +98,33 @@ def test_what_is_not_is_no(rows: list[Row], given: dict[str, Any], fault: str) -
     assert found.holds is False and fault in found.verdict.split("expected otherwise")[1]
 
 
+def test_sigmas_that_allow_nothing_are_no_yes() -> None:
+    quiet = finished([row("keep")] * 20)
+    blind = [
+        one
+        for change in ("turned", "focal")
+        for one in finished([row("inconclusive", 0.4)] * 20, rig="quad", change=change)
+    ]
+    found = answer([*quiet, *blind])
+    assert found.holds is None and found.verdict.startswith("sigmas allow too little to be found")
+    half = finished([FOUND] * 20, rig="triple", change="turned")
+    assert answer([*quiet, *blind[:20], *half]).holds is True
+    assert answer([*quiet, *blind, *half]).holds is None
+    # of two cameras, and of what is not meant to be found, none is asked
+    assert answer(finished([row("keep", 0.2)] * 20, rig="quad", change="baseline")).holds is True
+    assert answer(finished([row("keep", 0.2)] * 20, change="turned")).holds is True
+
+
+def test_untouched_rigs_are_counted_together_too() -> None:
+    """Of 20 each 4 are chance (0.016); 12 of 60 are not (0.00004)."""
+    each = [row("replace")] * 4 + [row("keep")] * 16
+    alone = [finished(each, rig=rig) for rig in RIGS]
+    assert answer(alone[0]).holds is True
+    found = answer([one for some in alone for one in some])
+    assert found.holds is False
+    assert found.verdict.endswith("expected otherwise: all rigs: 12 of 60 untouched rigs replaced")
+
+
 def test_of_two_cameras_no_name_is_asked() -> None:
     rows = [row("replace", 1.0, nameable=True)] * 20
     assert not broken(summarise("", "turned", 2, 0.95, rows))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from experiments.planar_pose import PlanarOptions, answer, predicted_distance, simulated, trial
+from experiments.planar_pose_answer import cases_of
 from experiments.runner.protocol import Finished, Row
 from graphs.planar import gather, solve_views
 
@@ -89,9 +92,37 @@ def test_it_holds_where_shares_are_as_predicted_and_a_pair_is_right() -> None:
     assert found.holds is True
     assert "2 of 2 cases of lone views as predicted" in found.verdict
     assert answer([finished(60, 0.1), RESOLVED]).holds is False
-    assert answer([finished(20, 0.1), finished(20, 0.1, how="votes")]).holds is False
+    assert answer([finished(20, 0.1), finished(40, 0.1, how="known_rig")]).holds is False
     near = finished(20, 0.1, how="votes", apart_deg=3.0)  # too near to count
     assert answer([finished(20, 0.1), near, RESOLVED]).holds is True
+
+
+def rigs(*n_wrong: int, how: str = "votes") -> list[Finished[PlanarOptions]]:
+    return [replace(finished(n, 0.2, how=how), seed=seed) for seed, n in enumerate(n_wrong)]
+
+
+@pytest.mark.parametrize("how", ["votes", "half_turns"])
+def test_a_rig_that_is_mirrored_is_one_of_so_many_rigs(how: str) -> None:
+    """One of ten: its 200 views are no 200 of 2000. The share scatters by as much as it is."""
+    (case,) = cases_of(rigs(200, *[0] * 9, how=how))
+    assert case.wrong == (pytest.approx(0.1), pytest.approx(0.1))
+    (none,) = cases_of(rigs(*[0] * 10, how=how))
+    assert none.wrong == (0, pytest.approx((1 / 12 * 11 / 12 / 10) ** 0.5))
+    (one,) = cases_of(rigs(3, how=how))
+    assert one.wrong == (pytest.approx(0.015), float("inf"))
+
+
+def test_votes_are_held_against_the_limit_with_their_scatter() -> None:
+    lone = finished(20, 0.1)
+    assert answer([lone, *rigs(*[0] * 10)]).holds is True
+    mirrored = answer([lone, *rigs(200, *[0] * 9)])
+    assert mirrored.holds is None and mirrored.verdict.startswith("too few trials to say: ")
+    assert answer([lone, *rigs(*[20, 24] * 5)]).holds is False
+    assert answer([lone, *rigs(20)]).holds is None  # one rig
+    assert "votes: 10.0 % (as usual)" in answer([lone, *rigs(20)]).verdict
+    assert answer([finished(90, 0.1), *rigs(200, *[0] * 9)]).holds is False
+    # a second camera by a known rig decides view by view: of 100 pairs 1.5 % may be chance
+    assert answer([lone, finished(3, 0.2, how="known_rig")]).holds is None
 
 
 def test_few_failed_and_missing_trials_are_no_answer() -> None:

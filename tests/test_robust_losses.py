@@ -17,7 +17,15 @@ from experiments.robust_losses import (
     simulated,
     trial,
 )
-from experiments.robust_losses_answer import answer, costs, grouped, in_words, ratio, regrets
+from experiments.robust_losses_answer import (
+    answer,
+    costs,
+    grouped,
+    in_words,
+    ratio,
+    regrets,
+    rivals,
+)
 from experiments.runner.protocol import Finished
 from experiments.runner.sweep import load_study, trials_of
 from graphs.losses import LossChoice
@@ -208,6 +216,30 @@ def test_losses_are_compared_in_the_same_scans() -> None:
     both = ratio(one, replace(other, square={s: 4.0 * v for s, v in one.square.items()}))
     assert both is not None and both == pytest.approx((0.5, 0.0))
     assert times > 1.4
+
+
+def test_a_rival_that_is_surely_better_is_not_hidden_by_one_that_may_be_by_more() -> None:
+    """Adaptive is 1.25 times better in every scan; none is by 1.5, at a scatter as large."""
+
+    def change(options: RobustLossesOptions, row: dict[str, Any]) -> dict[str, Any]:
+        if (options.way, options.outlier_share) != ("library", 0.1):
+            return row
+        if options.loss == "cauchy":
+            return row | {"off": 1.25 * row["off"] / 1.026}
+        if options.loss == "none":
+            lucky = int(row["nees"] * 1000) % 2
+            return row | {"off": 0.3 if lucky else 1.15}
+        return row
+
+    found = rows(change)
+    groups = grouped(found)
+    times, error, best, _ = regrets(groups, "cauchy")[0]
+    assert best in ("adaptive", "huber") and times == pytest.approx(1.25, abs=0.03)
+    assert error < 0.01
+    largest = max(r[0] for over in rivals(groups, "cauchy") for r in over)
+    assert largest > 1.3
+    said = answer(found)
+    assert said.holds is False and f"cauchy {largest:.2f}" in said.verdict
 
 
 def test_the_config_is_one() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,14 +110,40 @@ def test_board_views_beside_a_scan_are_told_apart() -> None:
 
 def test_errors_that_are_not_as_stated_say_nothing() -> None:
     good = answer(made(169))
-    assert "errors are 1.00 ± 0.00 times as stated" in good.verdict
+    same = "errors are 1.00 ± 0.00 (of boards) and 1.00 ± 0.00 (of scans) times as stated"
+    assert same in good.verdict
     wrong = answer(made(169, ratio=2.0))
     assert wrong.holds is None and wrong.verdict.startswith("errors are not as stated: ")
-    # those of the boards are: 40 scans of 48 calibrations err by 2
-    assert f"{((40 * 4 + 8) / 48) ** 0.5:.2f} ± 0.00 times" in wrong.verdict
+    assert "1.00 ± 0.00 (of boards) and 2.00 ± 0.00 (of scans) times" in wrong.verdict
     row = wrong.tables[0].rows[0]
     assert float(row[4]) == pytest.approx(169, rel=0.06)  # type: ignore[arg-type]
     assert row[7] == "more than 400"  # by errors, 676
+
+
+def test_a_few_boards_that_err_more_than_stated_are_not_lost_among_scans() -> None:
+    """Both together would be 1.09 times as stated."""
+    trials = made(169)
+    boards = [replace(one, row={**one.row, "px": 1.45 * LEVEL}) for one in trials[:8]]
+    found = answer([*boards, *trials[8:]])
+    assert found.holds is None and found.verdict.startswith("errors are not as stated: ")
+    assert "1.45 ± 0.00 (of boards) and 1.00 ± 0.00 (of scans)" in found.verdict
+
+
+def test_scans_that_are_too_short_are_no_contradiction() -> None:
+    """By counting 169 images: 200 that do not reach it leave 338 open; 50 say nothing."""
+
+    def up_to(longest: int, equal_at: float = 1e4, **given: Any) -> Trials:
+        every = made(equal_at, **given)
+        return [t for t in every if t.options.source == "boards" or t.options.images <= longest]
+
+    assert answer(up_to(200)).holds is True
+    assert answer(up_to(400)).holds is False
+    short = answer(up_to(50))
+    assert short.holds is None and short.verdict.startswith("scans are too short to say: ")
+    assert answer(up_to(50, 30)).holds is False  # far too early is one, however short they are
+    other = [t for t in made(1e4, features=50) if t.options.source == "scan"]  # 675 by counting
+    assert answer([*made(169), *[t for t in other if t.options.images <= 200]]).holds is True
+    assert answer([*made(40), *[t for t in other if t.options.images <= 200]]).holds is False
 
 
 def test_of_little_nothing_is_said() -> None:

@@ -232,11 +232,35 @@ def test_few_trials_answer_too() -> None:
     every = rows()
     for some in (every[:1], every[1:2], every[:3], [every[0], replace(every[1], error="why")]):
         found = answer(some)
-        assert found.holds is None and found.verdict.startswith("too few trials to say")
+        assert found.holds is None and found.verdict.startswith("too little to say")
     beyond = answer([Finished(t.options, t.seed, {**t.row, "condition": 1e18}, 0.1) for t in every])
     assert beyond.holds is None and "Cholesky" not in beyond.verdict
     nothing: Answer = answer([replace(t, row={}, error="no") for t in every])
     assert nothing.holds is None and nothing.verdict == "none of 60 trials was finished"
+
+
+def test_a_motion_in_which_nothing_fails_counts_in_the_median() -> None:
+    """QR fails in one of two at 1e15: the typical motion is one of which nothing is known."""
+    every = rows()
+    good = [
+        replace(t, row={**t.row, "qr_sigma_error": 1e-3})
+        if t.options.motion == MOTIONS[0] and t.row["qr_sigma_error"] > 0.1
+        else t
+        for t in every
+    ]
+    found = answer(good)
+    assert found.holds is None and found.verdict.startswith("too little to say")
+    assert "QR fails in 1 of 2 cases from cond(J) 1e+15" in found.verdict
+    row = {row[0]: row for row in found.tables[0].rows}["QR"]
+    assert row[1] is None and row[2:4] == (1e15, 1e15) and row[-2:] == (1, 2)
+    # of Cholesky the judge sees far beyond where it should
+    fine = [
+        replace(t, row={**t.row, "cholesky_sigma_error": 1e-5})
+        if t.options.motion == MOTIONS[0]
+        else t
+        for t in every
+    ]
+    assert answer(fine).holds is False
 
 
 def test_failures_are_counted() -> None:

@@ -16,8 +16,8 @@ SETTLED_M = 1e-6  # a step that moves no point farther
 # Or one that changes the rms by less of it: what slides, as a sphere turns, never rests.
 SETTLED_RMS = 1e-6
 LEAST_MATCHED = 10  # points; six tell a place
-# Stages of `laid_on`: points farther than so many of the limit do not pull. A wide one first finds
-# the place, and what has no counterpart bends the last one least.
+# Stages of `align_icp`: points farther than so many of the limit do not pull. A wide one first
+# finds the place, and what has no counterpart bends the last one least.
 STAGES = (4.0, 2.0, 1.0)
 
 
