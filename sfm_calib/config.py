@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 import yaml
@@ -29,6 +30,7 @@ from sfm_calib.files import read_text
 
 RIG_FILE = "rig.yaml"
 FEWEST_TWINS = 10  # the mean of fewer is known to a third and less
+OF_A_UNION = re.compile(r"^constrained-|[\[(].*[\])]$")
 QUATERNION_TOLERANCE = 0.01  # typed by hand to two digits
 
 
@@ -268,11 +270,26 @@ def read_yaml(path: Path) -> object:
     """What a YAML file holds. Raises CalibrationError naming the line that is wrong."""
     text = read_text(path, "write it as YAML")
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _NoKeyTwice)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         where = getattr(error, "problem_mark", None)
         line = f" in line {where.line + 1}" if where else ""
         raise CalibrationError(f"{path} is not valid YAML{line}: {error_text(error)}") from error
+
+
+class _NoKeyTwice(yaml.SafeLoader):
+    """YAML in which a key that stands twice is an error: the last would win without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[object] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {key.value!r} stands twice", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def error_text(error: Exception) -> str:
@@ -294,7 +311,9 @@ def first_problem(
     # A misspelt key is often also a missing one; the misspelling is what to tell.
     unknown = (problem for problem in problems if problem["type"] == "extra_forbidden")
     problem = next(unknown, problems[0])
-    where = spell(".".join(str(part) for part in problem["loc"]))
+    # Pydantic names which of several types it tried, such as constrained-int.
+    parts = [str(part) for part in problem["loc"] if not OF_A_UNION.search(str(part))]
+    where = spell(".".join(parts))
     if problem["type"] == "extra_forbidden":
         names = sorted(model.model_fields) if model else _valid_names(problem["loc"])
         close = difflib.get_close_matches(str(problem["loc"][-1]), names, n=1, cutoff=0.0)

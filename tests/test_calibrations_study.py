@@ -274,8 +274,7 @@ def test_the_fleet_example_is_a_fleet_once_its_paths_are_there(
 ) -> None:
     path = ROOT / "configs/fleet.yaml"
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CalibrationError, match="is not there"):
-        trials_of(load_study(path))
+    before = {trial.key for trial in trials_of(load_study(path))}
     content = yaml.safe_load(path.read_text())
     rig = make_rig("stereo")
     for one in content["list"]:

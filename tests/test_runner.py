@@ -89,8 +89,24 @@ def test_bugs_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_file_that_is_no_row_is_named(tmp_path: Path) -> None:
     path = tmp_path / "x.parquet"
     path.write_text("no Parquet")
-    with pytest.raises(CalibrationError, match=r"x\.parquet is no row of a study .*delete it"):
+    with pytest.raises(
+        CalibrationError, match=r"x\.parquet is not its trial's row .*run the study again"
+    ):
         read_row(path)
+
+
+@pytest.mark.usefixtures("at_once")
+def test_rows_that_cannot_be_read_are_made_anew(tmp_path: Path) -> None:
+    """Those cut short, and those of another trial under its name."""
+    path, out = study(tmp_path), tmp_path / "out"
+    here(path, out)
+    first, second, third, *_ = sorted((out / "rows").glob("*.parquet"))
+    first.write_bytes(b"")
+    second.write_bytes(third.read_bytes())
+    with pytest.raises(CalibrationError, match=r"is not its trial's row .*\(2 files are so\)"):
+        read_results(out)
+    assert {row.key for row in here(path, out)} == {first.stem, second.stem}
+    assert read_row(second).key == second.stem
 
 
 # ---- resuming ------------------------------------------------------------------------------
@@ -250,6 +266,8 @@ def test_its_end_is_told(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         (["--set", "options.drws=2"], "did you mean 'draws'"),
         (["--jobs", "0"], "--jobs 0: give 1 or more"),
+        (["--cluster", "nonsense"], "--cluster nonsense is no address: give one such as tcp"),
+        (["--cluster", "no.json"], "--cluster no.json: there is no such scheduler file"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -263,6 +281,32 @@ def test_bad_input_is_one_line(
 
 
 @pytest.mark.usefixtures("at_once")
+@pytest.mark.usefixtures("at_once")
+def test_a_run_of_which_nothing_came_says_so_to_scripts(tmp_path: Path) -> None:
+    path = study(tmp_path, "study: example\ngrid: {draws: [1, 2]}")
+    assert main(["run", str(path), "-o", str(tmp_path / "a")]) == 0
+    path = study(tmp_path, "study: example\noptions: {draws: 1}")
+    assert main(["run", str(path), "-o", str(tmp_path / "b")]) == 1
+
+
+def test_what_is_missing_is_said_before_and_refused_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And no results go among what trials read."""
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    text = "study: calibrations\noptions: {command: calibrate}\n"
+    path = study(tmp_path, f"{text}list: [{{scan: {scan}}}, {{scan: {tmp_path / 'none'}}}]")
+    assert main(["run", str(path), "-o", str(tmp_path / "out"), "--dry-run"]) == 0
+    said = capsys.readouterr()
+    assert f"note: {tmp_path / 'none'} is not there" in said.err and "2 trials" in said.out
+    keys = {trial.key for trial in trials_of(load_study(path))}
+    (tmp_path / "none").mkdir()
+    assert len(keys & {trial.key for trial in trials_of(load_study(path))}) == 1
+    assert main(["run", str(path), "-o", str(scan), "--dry-run"]) == 2
+    assert "is what trials read" in capsys.readouterr().err
+
+
 def test_results_go_where_the_file_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert RunCommand(study(tmp_path, "study: example"), jobs=1).run([]) == 0

@@ -17,7 +17,7 @@ import pytest
 from synthetic.studies import command, here, planned, rows_of, study, wait_for, wait_until
 
 from experiments.runner.attempt import Job
-from experiments.runner.cluster import _check_alike
+from experiments.runner.cluster import _check_alike, connected
 from experiments.runner.pool import Slot
 from experiments.runner.rows import StoredRow, read_row
 from experiments.runner.run import run
@@ -150,7 +150,8 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
             if len(made) == 15:
                 workers[0].kill()
 
-        run(planned(path, spread), spread, known, told)
+        with connected(known) as client:
+            run(planned(path, spread), spread, client, told)
         assert workers[0].wait() == -signal.SIGKILL
     assert rows_of(spread) == rows_of(alone)
     assert len(made) == 60
@@ -167,9 +168,8 @@ def test_workers_of_another_release_are_refused(monkeypatch: pytest.MonkeyPatch)
             _check_alike("worker", other)
 
 
-def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.runner.cluster.CONNECT_S", 0.5)
-    with pytest.raises(CalibrationError, match="no Dask scheduler answers at tcp"):
-        run(
-            planned(study(tmp_path), tmp_path / "out"), tmp_path / "out", "tcp://127.0.0.1:1", print
-        )
+    refused = pytest.raises(CalibrationError, match="no Dask scheduler answers at tcp")
+    with refused, connected("tcp://127.0.0.1:1"):
+        pass

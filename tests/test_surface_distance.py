@@ -225,6 +225,15 @@ def record(out: Path) -> dict[str, object]:
     return content
 
 
+def test_inputs_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = write(box(), tmp_path / "painted.ply"), write(box(), tmp_path / "b.ply")
+    before = a.read_bytes()
+    for files in ((a, b), (b, a)):
+        assert main(["surface-distance", *map(str, files), "-o", str(tmp_path)]) == 2
+        assert "painted.ply would be overwritten" in capsys.readouterr().err
+    assert a.read_bytes() == before
+
+
 def test_a_shifted_cube(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     up = Transform(np.eye(3), np.array([0.0, 0, 0.01]))
     a, b = write(box().moved(up), tmp_path / "a.ply"), write(box(), tmp_path / "b.ply")

@@ -63,7 +63,9 @@ def test_a_setting_joins_what_was_listed_apart(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("study: exmple", "there is no study 'exmple'; did you mean 'example'?"),
-        ("seeds: 3", "study: Field required"),
+        ("seeds: 3", "names no study: begin with 'study: NAME'"),
+        ("study: example\nseeds: 1\nseeds: 2", "in line 3: the key 'seeds' stands twice"),
+        ("study: example\nseeds: 1000000000000", "seeds: Input should be"),
         ("study: example\nseed: 3", "unknown key 'seed': did you mean 'seeds'?"),
         ("study: example\nseeds: 0", "seeds"),
         ("study: example\nthreads: 0", "threads"),

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import logging
+import re
 import sys
 import uuid
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 from experiments.runner.attempt import GIT, Job, attempt, code_state, failed, stored
-from experiments.runner.rows import StoredRow
+from experiments.runner.rows import StoredRow, error_line
 from sfm_calib.errors import CalibrationError
 
 CONNECT_S = 10
@@ -30,15 +33,28 @@ def distributed() -> Any:
         ) from error
 
 
-def run_on_cluster(jobs: Iterable[Job], address: str) -> Iterator[StoredRow]:
-    """Rows as they finish, from the workers of the scheduler at `address`, or of its file.
+@contextmanager
+def connected(address: str | None) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of its file; None of none.
 
-    Raises CalibrationError when there is no scheduler, when it is lost, and when its workers do not
-    have this project.
+    Raises CalibrationError when there is no scheduler, and when its workers do not have this
+    project.
     """
+    if address is None:
+        yield None
+        return
     dask = distributed()
+    is_file = address.endswith(".json")
+    if is_file and not Path(address).is_file():
+        raise CalibrationError(f"--cluster {address}: there is no such scheduler file")
+    if not is_file and not re.fullmatch(r"([a-z]+://)?[^:/\s]+:\d+", address):
+        raise CalibrationError(
+            f"--cluster {address} is no address: give one such as tcp://10.0.0.1:8786, as "
+            "`dask scheduler` prints it"
+        )
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # our own message says it
     try:
-        place = "scheduler_file" if address.endswith(".json") else "address"
+        place = "scheduler_file" if is_file else "address"
         client = dask.Client(**{place: address}, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise CalibrationError(
@@ -47,19 +63,31 @@ def run_on_cluster(jobs: Iterable[Job], address: str) -> Iterator[StoredRow]:
         ) from error
     with closing(client):
         _check_workers(client, address)
-        try:
-            yield from _rows(dask, client, iter(jobs))
-        except (dask.comm.CommClosedError, dask.CancelledError, OSError) as error:
-            raise CalibrationError(
-                f"the scheduler at {address} was lost ({error or type(error).__name__}); finished "
-                "trials are kept: run again to go on"
-            ) from error
+        yield client
+
+
+def run_on(client: Any, jobs: Iterable[Job]) -> Iterator[StoredRow]:
+    """Rows as they finish, from the workers of a scheduler.
+
+    Raises CalibrationError when it is lost, and for workers of another release that came later.
+    """
+    dask = distributed()
+    try:
+        yield from _rows(dask, client, iter(jobs))
+    except (dask.comm.CommClosedError, dask.CancelledError, OSError) as error:
+        raise CalibrationError(
+            f"the scheduler was lost ({error_line(error)}); finished trials are kept: run again "
+            "to go on"
+        ) from error
 
 
 def _check_workers(client: Any, address: str) -> None:
     """Raises CalibrationError where workers would run another release than this one."""
     if not client.nthreads():
-        print(f"{address} has no workers yet: start some with `dask worker`", file=sys.stderr)
+        print(
+            f"{address} has no workers yet: waiting for some (`dask worker {address}`)",
+            file=sys.stderr,
+        )
         return
     try:
         theirs = client.run(code_state)

@@ -23,7 +23,7 @@ from experiments.runner.protocol import Cell, Finished
 from experiments.runner.registry import study_of
 from experiments.runner.sweep import StudyConfig, Trial, load_study
 from sfm_calib.errors import CalibrationError
-from sfm_calib.files import read_text, write_atomically
+from sfm_calib.files import write_atomically
 
 STUDY_FILE, TRIALS_FILE = "study.yaml", "trials.json"
 ROWS_FOLDER, ROWS_FILE = "rows", "rows.parquet"
@@ -137,6 +137,8 @@ def read_row(path: Path) -> StoredRow:
     """A trial's row. Raises CalibrationError for a file that is none."""
     try:
         (columns,) = arrow().parquet.ParquetFile(path).read().to_pylist()
+        if columns[META + "key"] != path.stem:
+            raise ValueError(f"it is that of trial {columns[META + 'key']}")
         return StoredRow(
             key=columns[META + "key"],
             seed=columns[META + "seed"],
@@ -153,7 +155,8 @@ def read_row(path: Path) -> StoredRow:
         )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise CalibrationError(
-            f"{path} is no row of a study ({error_line(error)}): delete it, and run again"
+            f"{path} is not its trial's row ({error_line(error)}): run the study again, which makes "
+            "it anew"
         ) from error
 
 
@@ -166,12 +169,24 @@ def error_line(error: BaseException) -> str:
 # ---- all rows ------------------------------------------------------------------------------
 
 
-def read_rows(results: Path, trials: Sequence[Trial]) -> dict[str, StoredRow]:
-    """The rows there are of these trials, by key."""
+def read_rows(results: Path, trials: Sequence[Trial], strict: bool = True) -> dict[str, StoredRow]:
+    """The rows there are of these trials, by key.
+
+    Raises CalibrationError for files that hold none, unless not `strict`: then they are not there.
+    """
     folder = results / ROWS_FOLDER
     there = {path.stem for path in folder.glob("*.parquet")}
     wanted = [trial.key for trial in trials if trial.key in there]
-    return {key: read_row(folder / f"{key}.parquet") for key in wanted}
+    rows, unreadable = {}, []
+    for key in wanted:
+        try:
+            rows[key] = read_row(folder / f"{key}.parquet")
+        except CalibrationError as error:
+            unreadable.append(error)
+    if unreadable and strict:
+        more = f" ({len(unreadable)} files are so)" if len(unreadable) > 1 else ""
+        raise CalibrationError(f"{unreadable[0]}{more}")
+    return rows
 
 
 def read_results(results: Path) -> Results:
@@ -208,13 +223,13 @@ def write_config(results: Path, config: StudyConfig, trials: Sequence[Trial]) ->
 def _read_trials(path: Path, study: str) -> list[Trial]:
     options = study_of(study).options
     try:
-        listed = json.loads(read_text(path, "run the study again"))
+        listed = json.loads(path.read_text(encoding="utf-8"))
         return [
             Trial(study, options.model_validate(t["options"]), t["seed"], t["key"]) for t in listed
         ]
-    except (ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibrationError(
-            f"{path} is not of this release ({error_line(error)}): run the study again"
+            f"{path} is not there, or not of this release ({error_line(error)}): run the study again"
         ) from error
 
 

@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.runner.attempt import Job
-from experiments.runner.cluster import run_on_cluster
+from experiments.runner.cluster import run_on
 from experiments.runner.pool import run_here
+from experiments.runner.registry import study_of
 from experiments.runner.rows import (
     STUDY_FILE,
     StoredRow,
@@ -84,7 +86,10 @@ def plan(
     Raises CalibrationError where OUT holds another study.
     """
     check_study(out, config)
-    rows = {} if fresh else read_rows(out, trials)
+    for path in {path for one in trials for path in study_of(one.study).inputs(one.options)}:
+        if out.exists() and path.is_dir() and path.resolve() == out.resolve():
+            raise CalibrationError(f"-o {out} is what trials read: choose another folder")
+    rows = {} if fresh else read_rows(out, trials, strict=False)
     again = ("broken", "failed", "refused") if retry else ("broken",)
     rows = {key: row for key, row in rows.items() if row.ending not in again}
     cores = len(os.sched_getaffinity(0))
@@ -95,31 +100,37 @@ def plan(
 def check_study(out: Path, config: StudyConfig) -> None:
     """Raises CalibrationError where OUT holds another study."""
     if (out / STUDY_FILE).exists():
-        other = load_study(out / STUDY_FILE).study
+        try:
+            other = load_study(out / STUDY_FILE).study
+        except CalibrationError:  # it is written anew; rows know their study
+            return
         if other != config.study:
             raise CalibrationError(
                 f"{out} holds results of the study {other!r}: choose another folder with -o"
             )
 
 
-def run(plan: Plan, out: Path, cluster: str | None, told: Told) -> dict[str, StoredRow]:
+def run(plan: Plan, out: Path, client: Any, told: Told) -> dict[str, StoredRow]:
     """Run what is to be done; every row is written as it finishes. All rows, by key.
+
+    client: of a Dask scheduler (`connected`); None: this machine.
 
     told: called with each row after it was written.
 
-    Raises CalibrationError where another run writes to OUT, and as `run_on_cluster`.
+    Raises CalibrationError where another run writes to OUT, and as `run_on`.
     """
     with locked(out):
         check_study(out, plan.config)
-        done = read_rows(out, plan.todo) if not plan.again else {}  # by a run that has just ended
+        done = (
+            read_rows(out, plan.todo, strict=False) if not plan.again else {}
+        )  # by a run that has just ended
         rows = {**plan.finished, **{k: r for k, r in done.items() if r.ending != "broken"}}
         todo = {trial.key: trial for trial in plan.trials if trial.key not in rows}
         forget(out, list(todo.values()))
         write_config(out, plan.config, plan.trials)
         jobs = (job_of(trial, plan.config, out) for trial in todo.values())
         try:
-            running = run_on_cluster(jobs, cluster) if cluster else run_here(jobs, plan.processes)
-            for row in running:
+            for row in run_on(client, jobs) if client else run_here(jobs, plan.processes):
                 write_row(out, todo[row.key], row)
                 rows[row.key] = row
                 told(row)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections import Counter
@@ -15,14 +16,18 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from experiments.runner.cluster import connected
+from experiments.runner.registry import study_of
 from experiments.runner.rows import StoredRow, arrow
 from experiments.runner.run import Pace, Plan, plan, run
-from experiments.runner.sweep import in_words, load_study, trials_of
+from experiments.runner.sweep import Trial, in_words, load_study, trials_of
 from sfm_calib.errors import CalibrationError
 from sfm_calib.output import output_folder
 from sfm_calib.terminal import print_line, result_console
 
+EXIT_NONE_DONE = 1
 MOST_SHOWN = 20  # trials of a dry run
+MOST_NAMES = 60  # options
 SECONDS_BETWEEN_LINES = 5.0
 
 
@@ -31,7 +36,8 @@ class RunCommand:
     """Run a study: every trial of its YAML, a row each; finished trials are not run again.
 
     Rows go to OUT/rows as they finish, and together to OUT/rows.parquet. A run that was interrupted
-    goes on where it was. `sfm-calib study OUT` draws the answer.
+    goes on where it was. `sfm-calib study OUT` draws the answer. Exits with 1 where no trial was
+    done: all were refused (their input, by a message), failed (a bug), or broken (the machine).
     """
 
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="YAML")]
@@ -50,7 +56,7 @@ class RunCommand:
     dry_run: bool = False
     """Print the trials and the time they will take, and run none."""
     retry: bool = False
-    """Run trials again that failed."""
+    """Run trials again that were refused or failed; broken ones always are."""
     fresh: bool = False
     """Run all trials again."""
 
@@ -64,13 +70,25 @@ class RunCommand:
         out = self.out or Path("out") / self.config.stem
         planned = plan(config, trials, out, self.jobs, self.retry, self.fresh)
         console = result_console()
+        _print_missing(planned.todo)
         if self.dry_run:
             _print_plan(planned, out, console)
             return 0
-        with output_folder(out), _progress(planned, self.cluster) as told:
-            rows = run(planned, out, self.cluster, told)
+        with (
+            output_folder(out),
+            connected(self.cluster) as client,
+            _progress(planned, self.cluster) as told,
+        ):
+            rows = run(planned, out, client, told)
         _print_end(planned, rows, out, console)
-        return 0
+        return 0 if any(row.ending == "done" for row in rows.values()) else EXIT_NONE_DONE
+
+
+def _print_missing(trials: Sequence[Trial]) -> None:
+    """Say on stderr what trials will refuse for."""
+    read = dict.fromkeys(p for one in trials for p in study_of(one.study).inputs(one.options))
+    for path in (path for path in read if not path.exists()):
+        print(f"note: {path} is not there; trials that read it will be refused", file=sys.stderr)
 
 
 def _print_plan(planned: Plan, out: Path, console: Console) -> None:
@@ -87,6 +105,8 @@ def _print_plan(planned: Plan, out: Path, console: Console) -> None:
     else:
         many = f"{planned.processes} at a time" if planned.processes > 1 else "one at a time"
         took = f"about {duration(seconds)} on this machine, {many}"
+    names = ", ".join(sorted(study_of(planned.config.study).options.model_fields)[:MOST_NAMES])
+    print_line(console, f"options of {planned.config.study}: {names}")
     print_line(console, f"{len(planned.trials)} trials{finished}; {took}")
 
 
@@ -97,7 +117,7 @@ def _print_end(planned: Plan, rows: dict[str, StoredRow], out: Path, console: Co
     errors = Counter(row.error for row in rows.values() if row.error is not None)
     for error, count in errors.most_common(MOST_SHOWN):
         print_line(console, f"  {count} x {error}")
-    print_line(console, f"sfm-calib study {out} draws the answer")
+    print_line(console, f"sfm-calib study {shlex.quote(str(out))} draws the answer")
 
 
 def duration(seconds: float) -> str:

@@ -37,7 +37,7 @@ class StudyConfig(BaseModel):
     grid: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = {}  # every combination
     list: tuple[dict[str, Any], ...] = ()  # combinations one by one
     seeds: (
-        Annotated[int, Field(ge=1)]
+        Annotated[int, Field(ge=1, le=MOST_TRIALS)]
         | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     ) = 1
     threads: Annotated[int, Field(ge=1)] | Literal["all"] = 1  # of one trial
@@ -79,6 +79,8 @@ def load_study(path: Path, settings: Sequence[str] = ()) -> StudyConfig:
         raise CalibrationError(f"{path} holds no keys: begin with 'study: NAME'")
     for setting in settings:
         _override(content, setting)
+    if "study" not in content:
+        raise CalibrationError(f"{path} names no study: begin with 'study: NAME'")
     try:
         config = StudyConfig.model_validate(content)
     except ValidationError as error:
@@ -147,8 +149,7 @@ def _check_keys(config: StudyConfig, path: Path) -> None:
 def trials_of(config: StudyConfig) -> list[Trial]:
     """Every trial, those of one seed together; options and inputs are checked here.
 
-    Raises CalibrationError naming the trial whose options are wrong, and for files that are
-    missing.
+    Raises CalibrationError naming the trial whose options are wrong.
     """
     study = study_of(config.study)
     combinations = math.prod(map(len, config.grid.values())) * max(1, len(config.list))
@@ -205,10 +206,8 @@ def _inputs(
     """Name and digest of every file that a trial reads."""
     found = []
     for path in study.inputs(options):
-        if not path.exists():
-            raise CalibrationError(f"{path} is not there, and a trial of the study reads it")
-        if path not in digests:
-            digests[path] = content_digest(path)
+        if path not in digests:  # without it the trial refuses, until it is there
+            digests[path] = content_digest(path) if path.exists() else "missing"
         found.append((str(path), digests[path]))
     return tuple(found)
 

@@ -122,6 +122,12 @@ def run_surface_distance(command: SurfaceDistance, arguments: Sequence[str]) -> 
 
 
 def _check(command: SurfaceDistance) -> None:
+    written = {(command.out / name).resolve() for name in (PAINTED_FILE, RECORD_FILE, PAGE_FILE)}
+    for path in (command.a, command.b):
+        if path.resolve() in written:
+            raise CalibrationError(
+                f"{path} would be overwritten by the result: choose another folder with -o"
+            )
     for name in ("max_correspondence", "crop", "metres_per_unit", "paint_to"):
         value = getattr(command, name)
         if value is not None and not (np.isfinite(value) and value > 0):
