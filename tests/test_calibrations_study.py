@@ -286,6 +286,7 @@ def test_the_fleet_example_is_a_fleet_once_its_paths_are_there(
             else:
                 place.write_text(json.dumps(rig.cameras[0].named()))
     trials = trials_of(load_study(path))
+    assert not before & {trial.key for trial in trials}
     assert len(trials) == len(content["list"]) and len({t.options.name for t in trials}) == len(
         trials
     )

@@ -155,8 +155,8 @@ def read_row(path: Path) -> StoredRow:
         )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise CalibrationError(
-            f"{path} is not its trial's row ({error_line(error)}): run the study again, which makes "
-            "it anew"
+            f"{path} is not its trial's row ({error_line(error)}): run the study again, which "
+            "makes it anew"
         ) from error
 
 
@@ -229,7 +229,7 @@ def _read_trials(path: Path, study: str) -> list[Trial]:
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibrationError(
-            f"{path} is not there, or not of this release ({error_line(error)}): run the study again"
+            f"{path} is not there, or of another release ({error_line(error)}): run the study again"
         ) from error
 
 
