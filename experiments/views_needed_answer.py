@@ -52,16 +52,23 @@ class Case:
         return jackknifed(lambda values: rms(values[:, 0]) / rms(values[:, 1]), both)
 
     @property
-    def nees(self) -> tuple[float, float]:
-        """Mean, and its standard error."""
-        return jackknifed(lambda values: float(values.mean()), self.column("nees"))
+    def nees(self) -> float:
+        """Median: where the lens is all but free single ones are millions, and their mean no
+        surer than itself."""
+        return float(np.median(self.column("nees")))
+
+    @property
+    def share_above(self) -> float:
+        """Of the trials, whose NEES is more than the median may be."""
+        return float((self.column("nees") > MOST_NEES).mean())
 
     @property
     def told(self) -> bool:
         """Whether neither the error over the picture nor that of the parameters is larger."""
-        return all(
-            value <= most + STANDARD_ERRORS * error
-            for (value, error), most in ((self.of_stated, MOST_OF_STATED), (self.nees, MOST_NEES))
+        ratio, error = self.of_stated
+        by_chance = STANDARD_ERRORS * 0.5 / len(self.trials) ** 0.5
+        return ratio <= MOST_OF_STATED + STANDARD_ERRORS * error and (
+            self.share_above <= 0.5 + by_chance
         )
 
 
@@ -128,7 +135,7 @@ def _ratio(case: Case) -> float:
 
 
 def _nees(case: Case) -> float:
-    return case.nees[0]
+    return case.nees
 
 
 def _differs(case: Case, usual: Any) -> str:
@@ -223,7 +230,7 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
     columns = (
         "source", "number", "tilt deg", "coverage", "distance m", "printed", "trials",
         "failed", "off px", "±",
-        "stated px", "off / stated", "± of it", "NEES", "± of NEES", "focal RMSE px",
+        "stated px", "off / stated", "± of it", "NEES, median", "share above", "focal RMSE px",
         "centre RMSE px", "picture seen", "warned %",
     )  # fmt: skip
     rows = []
@@ -232,7 +239,7 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
         warned: list[Any] = [each.row["warned"] for each in case.trials]
         warned = [each for each in warned if each is not None]
         numbers = (
-            *case.off_px, rms(case.column("stated_px")), *case.of_stated, *case.nees,
+            *case.off_px, rms(case.column("stated_px")), *case.of_stated, case.nees, case.share_above,
             rms(case.column("focal_px")), rms(case.column("centre_px")),
             float(case.column("seen").mean()), 100 * np.mean(warned) if warned else np.nan,
         )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,8 @@ def test_other_laws_and_too_small_sigmas_do_not() -> None:
     narrow = answer([*by_number(-0.5), *flat])
     assert narrow.holds is False
     assert "at tilt_deg 0.0: 1.00 of what is stated, NEES 30" in narrow.verdict
+    wild = [replace(one, row={**one.row, "nees": 4.0 * 10.0 ** (3 * one.seed)}) for one in flat]
+    assert answer([*by_number(-0.5), *wild]).holds is False, "a mean is no surer than itself"
 
 
 def test_a_scan_twice_as_bad_takes_four_times_the_frames() -> None:
