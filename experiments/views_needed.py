@@ -8,7 +8,7 @@ squared error (NEES). Power laws are fitted to the errors over the number.
 Expectation: the handbooks' 20 to 30 images, tilted by up to 45 degrees, over the whole picture, are
 no threshold: from 10 views on the error falls as 1 / sqrt(n), 20 to 30 views gain 18 %, and the
 stated covariance is not too small in any case, be they too few, too flat or too central: the error
-is at most 1.4 times what is stated, the NEES at most 2 (its median), within two standard errors.
+is at most 1.4 times what is stated, the median NEES at most 2, within two standard errors.
 Source: "20 to 30 images" is folklore (10 to 20 in MathWorks' and OpenCV's pages); 1 / sqrt(n) holds
 for independent views. Corner noise and scans as measured (see CORNER_PX, FEATURE_PX).
 Run: sfm-calib run configs/studies/views_needed.yaml -o out/views_needed
