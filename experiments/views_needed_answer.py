@@ -239,7 +239,8 @@ def cases_table(cases: Sequence[Case]) -> AnswerTable:
         warned: list[Any] = [each.row["warned"] for each in case.trials]
         warned = [each for each in warned if each is not None]
         numbers = (
-            *case.off_px, rms(case.column("stated_px")), *case.of_stated, case.nees, case.share_above,
+            *case.off_px, rms(case.column("stated_px")), *case.of_stated,
+            case.nees, case.share_above,
             rms(case.column("focal_px")), rms(case.column("centre_px")),
             float(case.column("seen").mean()), 100 * np.mean(warned) if warned else np.nan,
         )  # fmt: skip
