@@ -88,6 +88,7 @@ def test_all_solvers_end_at_the_same_cost(row: Row) -> None:
     check_costs([row])
 
 
+@pytest.mark.slow
 def test_a_row_is_complete_and_in_order(row: Row) -> None:
     assert (row.observations, row.frames) == (SMALL.observations, SMALL.frames)
     assert row.points == 219

@@ -190,6 +190,7 @@ def test_without_noise_the_true_rig_makes_the_head() -> None:
     assert 0.4 < np.mean(painted >= 0) < 0.9 and painted.max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_trial_depends_on_its_seed_alone_and_an_uncalibrated_cabin_is_worse() -> None:
     exact = CabinOptions(**EXACT)  # type: ignore[arg-type]
     row = trial(exact, 1)

@@ -99,6 +99,7 @@ def test_a_calibration_after_a_check_reuses_its_stages(tmp_path, checked, capfd)
     assert "solving" in stages and not {"extracting", "matching", "mapping"} & stages
 
 
+@pytest.mark.slow
 def test_json_is_all_of_stdout(tmp_path, checked, capfd):
     out = tmp_path / "out"
     shutil.copytree(checked, out)
