@@ -9,6 +9,7 @@ import numpy as np
 from experiments.cabin_calibration import CabinOptions
 from experiments.cabin_model import FAILED_MM
 from experiments.runner.protocol import Finished
+from experiments.standard_errors import mean_and_error
 
 Trials = Sequence[Finished[CabinOptions]]
 Cases = Mapping[str, Trials]  # finished ones, by what is said of the case
@@ -70,9 +71,7 @@ def mean(trials: Trials, column: str) -> tuple[float, float]:
     """Mean over trials that measured it and its standard error, infinite of one."""
     values = np.array([number(one, column) for one in trials])
     values = values[np.isfinite(values)]
-    if len(values) < 2:
-        return float(values.mean()) if len(values) else float("nan"), float("inf")
-    return float(values.mean()), float(values.std(ddof=1) / len(values) ** 0.5)
+    return mean_and_error(values) if len(values) else (float("nan"), float("inf"))
 
 
 def paired(trials: Trials, others: Trials, column: str) -> tuple[float, float]:
@@ -80,9 +79,10 @@ def paired(trials: Trials, others: Trials, column: str) -> tuple[float, float]:
     there = {one.seed: number(one, column) for one in others}
     less = np.array([number(one, column) - there[one.seed] for one in trials if one.seed in there])
     less = less[np.isfinite(less)]
-    if len(less) < FEWEST:
-        return float(less.mean()) if len(less) else float("nan"), float("inf")
-    return float(less.mean()), float(less.std(ddof=1) / len(less) ** 0.5)
+    if not len(less):
+        return float("nan"), float("inf")
+    found, error = mean_and_error(less)
+    return found, error if len(less) >= FEWEST else float("inf")
 
 
 def common(trials: Trials, others: Trials, column: str) -> tuple[Trials, Trials]:

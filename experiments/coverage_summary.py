@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.runner.protocol import Row
+from experiments.standard_errors import WITHIN_95, mean_and_error
 from graphs.frames import FloatArray
 
 # What is promised, by the kind of noise.
@@ -21,7 +22,6 @@ WIDENED = 3.0
 COVERAGE_OF_20, BOUND_OF_20 = 0.02, 0.05
 FEWEST_SCANS = 10  # of a case: of fewer chance alone decides
 
-WITHIN_95 = 1.959964  # sigmas
 ALL = "all"  # kinds of parameters
 
 
@@ -127,13 +127,6 @@ def by_kind(kinds: Sequence[str], values: FloatArray) -> dict[str, float]:
     of = np.array(kinds)
     means = {kind: float(values[of == kind].mean()) for kind in dict.fromkeys(kinds)}
     return means | {ALL: float(values.mean())}
-
-
-def mean_and_error(values: FloatArray) -> tuple[float, float]:
-    """Mean and its standard error, infinite of a single value."""
-    if len(values) < 2:
-        return float(np.mean(values)), float("inf")
-    return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
 def broken(summary: Summary) -> list[str]:

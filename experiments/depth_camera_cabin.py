@@ -25,7 +25,6 @@ Run: sfm-calib run configs/studies/depth_camera_cabin.yaml -o out/depth_camera_c
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,11 +32,10 @@ from experiments.cabin_answer import answer
 from experiments.cabin_calibration import CabinOptions, Calibrated, calibrate_cabin
 from experiments.cabin_model import model_row, taken
 from experiments.runner.protocol import Row, Study
-from graphs.frames import FloatArray, angle_between
+from experiments.standard_errors import WITHIN_95, rms
+from graphs.frames import angle_between
 from sfm_calib.simulate.cabin import Cabin, draw_cabin
 from sfm_calib.simulate.rigs import SimulatedRig
-
-WITHIN_95 = 1.959964  # sigmas
 
 
 def trial(options: CabinOptions, seed: int) -> Row:
@@ -89,11 +87,6 @@ def calibration_row(cabin: Cabin, found: Calibrated) -> Row:
         row[f"{kind}_focal_px"] = rms(off[:, 0])
         row[f"{kind}_centre_px"] = rms(np.linalg.norm(off[:, 2:], axis=1))
     return row
-
-
-def rms(values: Sequence[float] | FloatArray) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 STUDY = Study(CabinOptions, trial, answer)

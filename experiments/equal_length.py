@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.standard_errors import mean_and_error, rms
+
 DRAWS, SEED = 400, 0  # of the seeds, with replacement
 INTERVAL = (0.16, 0.84)  # as one standard error to each side
 
@@ -23,14 +25,13 @@ class Curve:
 
     def rms(self, images: int) -> float:
         """Over all seeds."""
-        return float(np.sqrt(np.mean(np.square(list(self.errors[images].values())))))
+        return rms(list(self.errors[images].values()))
 
     def rms_error(self, images: int) -> float:
         """Standard error of the rms, from the scatter of the seeds; infinite of a single one."""
         square = np.square(list(self.errors[images].values()))
-        if len(square) < 2:
-            return float("inf")
-        return float(np.std(square, ddof=1) / len(square) ** 0.5 / (2 * np.sqrt(square.mean())))
+        mean, error = mean_and_error(square)
+        return error / (2 * mean**0.5)
 
     def drawn(self, seeds: Sequence[int]) -> Curve:
         """Of these seeds, some of them often; without lengths of which none is left."""

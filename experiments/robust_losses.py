@@ -30,6 +30,7 @@ from pydantic import Field
 from experiments.coverage import inverse_information, measured_prior, nees
 from experiments.robust_losses_answer import answer
 from experiments.runner.protocol import Row, Study, TrialOptions
+from experiments.standard_errors import WITHIN_95
 from graphs.build import GraphOptions, build
 from graphs.frames import FloatArray
 from graphs.jackknife import change
@@ -53,7 +54,6 @@ from sfm_calib.simulate.keypoints import OutlierKind, with_outliers
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
 MIN_PARALLAX_DEG = 1.0  # as rig.yaml has it
-WITHIN_95 = 1.959964  # sigmas
 FREEDOM = 3.0  # of Student's t: it has a variance, and no fourth moment
 # What an efficient estimate gains by knowing the tails: the information of a place under a t of two
 # dimensions is (v + 2) / (v + 4) of a Gaussian's of the same scale (Lange, Little, Taylor 1989).

@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.runner.figures import Series, lines
 from experiments.runner.protocol import Answer, AnswerFigure, AnswerTable, Finished
+from experiments.standard_errors import mean_and_error
 from graphs.frames import FloatArray
 
 DEFAULT = "cauchy"  # of rig.yaml
@@ -105,13 +106,6 @@ def _group(loss: str, condition: Condition, some: Trials) -> Group:
         statistics.median(row["iterations"] for row in solved) if solved else None,
         sum(not row["converged"] for row in solved),
     )  # fmt: skip
-
-
-def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and its standard error, infinite of a single value."""
-    if len(values) < 2:
-        return float(np.mean(values)), float("inf")
-    return float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5)
 
 
 def ratio(one: Group, other: Group) -> tuple[float, float] | None:

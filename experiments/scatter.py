@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.runner.protocol import Row
+from experiments.standard_errors import jackknifed, mean_and_error
 from graphs.frames import FloatArray
 
 STANDARD_ERRORS = 3.0  # within which a value may miss what is expected
@@ -24,8 +25,8 @@ def stacked(rows: Sequence[Row], key: str) -> FloatArray:
 
 def mean_of(values: FloatArray) -> Value:
     """Mean of values (n,)."""
-    n = len(values)
-    return float(values.mean()), float(values.std(ddof=1) / n**0.5) if n > 1 else None
+    mean, error = mean_and_error(values)
+    return mean, error if len(values) > 1 else None
 
 
 def root_of(squares: FloatArray) -> Value:
@@ -37,12 +38,8 @@ def root_of(squares: FloatArray) -> Value:
 
 def ratio_of(pairs: FloatArray) -> Value:
     """Ratio of the two means of pairs (n, 2); its standard error with one left out at a time."""
-    total, n = pairs.sum(0), len(pairs)
-    ratio = float(total[0] / total[1])
-    if n < 2:
-        return ratio, None
-    without = (total[0] - pairs[:, 0]) / (total[1] - pairs[:, 1])
-    return ratio, float(((n - 1) / n * ((without - without.mean()) ** 2).sum()) ** 0.5)
+    ratio, error = jackknifed(lambda some: float(some[:, 0].sum() / some[:, 1].sum()), pairs)
+    return ratio, error if len(pairs) > 1 else None
 
 
 def within(value: Value, low: float, high: float) -> bool:

@@ -1,4 +1,4 @@
-"""Standard errors of whatever is computed from independent trials."""
+"""Means, roots and ratios over independent trials, with the standard errors of each."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from graphs.frames import FloatArray
+
+WITHIN_95 = 1.959964  # sigmas that 95 % of normal errors stay within
 
 
 def jackknifed(
@@ -28,6 +30,12 @@ def jackknifed(
     return whole, float(np.sqrt((n - 1) / n * spread))
 
 
-def rms(values: FloatArray) -> float:
+def mean_and_error(values: Sequence[float] | FloatArray) -> tuple[float, float]:
+    """Mean and its standard error, infinite of a single value."""
+    n = len(values)
+    return float(np.mean(values)), float(np.std(values, ddof=1) / n**0.5) if n > 1 else float("inf")
+
+
+def rms(values: Sequence[float] | FloatArray) -> float:
     """Root mean square of values of any shape."""
     return float(np.sqrt(np.mean(np.square(values))))
