@@ -163,10 +163,8 @@ def _lens_of(problem: Problem, groups: Sequence[tuple[int, ...]]) -> tuple[int, 
 
 
 def root_information(problem: Problem, options: GraphOptions) -> FloatArray:
-    """1 / sigma of each observation's pixel coordinates (n_obs,)."""
-    relative = problem.observations.relative_sigma
-    ones = np.ones(len(problem.observations))
-    return 1 / (options.sigma_px * (ones if relative is None else relative))
+    """Of each observation's pixel, the upper triangle (n_obs, 3) by rows."""
+    return problem.observations.whitening / options.sigma_px
 
 
 def lens_prior_factor(camera: int, prior: LensPrior) -> gtsam.NonlinearFactor:

@@ -36,7 +36,7 @@ class Cluster:
     frame: IntArray  # (n_obs,)
     camera: IntArray  # (n_obs,)
     pixels: FloatArray  # (n_obs, 2)
-    root_information: FloatArray  # (n_obs,) 1 / sigma of a pixel coordinate
+    root_information: FloatArray  # (n_obs, 3) of the pixels, upper triangles by rows
     anchors: FloatArray  # (n_points, 3)
     corner: IntArray | None = None  # (n_points,) of the board; None: points to be triangulated
     still: IntArray | None = None  # (n_points,) 1: of the board in the scene's world
@@ -115,7 +115,7 @@ def make_tracks(
 ) -> Tracks:
     """Cut a problem's tracks into clusters along the fronts of an elimination.
 
-    root_information (n_obs,): 1 / sigma of a pixel coordinate.
+    root_information (n_obs, 3): of the pixels, upper triangles by rows.
     """
     seen, start = problem.observations, problem.initial
     at = np.argsort(elimination.order)[seen.frame]  # position of each frame in the order

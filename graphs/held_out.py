@@ -18,7 +18,7 @@ from graphs.camera import lens_arrays
 from graphs.frames import FloatArray, Transform
 from graphs.lenses import project_many
 from graphs.losses import LOSS_INDEX, weigh_many
-from graphs.problem import Estimate, IntArray, Observations, Problem
+from graphs.problem import Estimate, IntArray, Observations, Problem, whitened
 from graphs.selection import MIN_TRACK_LENGTH, compact
 from graphs.solve import solve
 
@@ -104,7 +104,7 @@ class _Seen:
     rig_translation: FloatArray  # (n, 3)
     observations: Observations
     estimate: Estimate
-    root_information: FloatArray  # (n,)
+    root_information: FloatArray  # (n, 3) upper triangles by rows
     options: GraphOptions
 
 
@@ -194,7 +194,7 @@ def _place(seen: _Seen, rotation: FloatArray, translation: FloatArray) -> _Place
         bends, costs,
     )  # fmt: skip
     by_shift = np.einsum("nij,njk->nik", by_point, seen.rig_rotation)
-    by_shift *= seen.root_information[:, None, None]
+    by_shift = whitened(by_shift, seen.root_information)
     by_turn = np.cross(in_rig[:, None, :], by_shift)  # a turn w moves the point by w x point
     by_pose = np.concatenate([by_turn, by_shift], axis=2)
     return _Placed(rotation, translation, residuals, weights, costs, by_pose)

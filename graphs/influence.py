@@ -174,7 +174,7 @@ def shared_errors(
             observation, point, frame, camera = influence.rows.T
             inside = cluster.pixels[observation] / sizes[camera]
             x, y = np.clip((inside * CELLS).astype(np.int64), 0, CELLS - 1).T
-            weight = cluster.root_information[observation] ** 2
+            weight = (cluster.root_information[observation] ** 2).sum(1) / 2
             corner = None if cluster.corner is None else cluster.corner[point]
             left = left_by_frame(in_frame[order[cluster.frames[frame]]])
             sums.add(influence, frame, (camera * CELLS + y) * CELLS + x, weight, corner, left)

@@ -64,7 +64,7 @@ def weigh_many(
     scale: float,
     projected: FloatArray,  # (n, 2), NaN where it was refused
     observed: FloatArray,  # (n, 2)
-    root_information: FloatArray,  # (n,) 1 / sigma of a pixel coordinate
+    root_information: FloatArray,  # (n, 3) upper triangles by rows
     residuals: FloatArray,  # out (n, 2), whitened, without the loss's weight
     weights: FloatArray,  # out (n,)
     bends: FloatArray,  # out (n,): along a residual r the curvature is weight (1 + bend r^2)
@@ -72,9 +72,10 @@ def weigh_many(
 ) -> None:
     """Whitened residuals, IRLS weights and costs; a refused projection weighs nothing."""
     for i in range(len(costs)):
-        root = root_information[i]
-        r0 = (projected[i, 0] - observed[i, 0]) * root
-        r1 = (projected[i, 1] - observed[i, 1]) * root
+        r0 = projected[i, 0] - observed[i, 0]
+        r1 = projected[i, 1] - observed[i, 1]
+        r0 = root_information[i, 0] * r0 + root_information[i, 1] * r1
+        r1 = root_information[i, 2] * r1
         s = r0 * r0 + r1 * r1
         if s < np.inf:
             residuals[i, 0], residuals[i, 1] = r0, r1

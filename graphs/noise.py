@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from graphs.build import GraphOptions
 from graphs.covariance import POSE_NAMES
 from graphs.frames import FloatArray
 from graphs.losses import weight_and_slope
-from graphs.problem import IntArray, KnownSpan, Problem, points_in_cameras
+from graphs.problem import IntArray, KnownSpan, Problem, points_in_cameras, whitened
 
 PLACES = tuple(f".{name}" for name in POSE_NAMES)
 # Median of the norm of a 2-D Gaussian of unit sigma (Rayleigh): sqrt(2 ln 2).
@@ -131,10 +132,12 @@ def robust_sigma_px(
 
 
 def residual_lengths(problem: Problem, residuals: FloatArray) -> FloatArray:
-    """Lengths (n_obs,) of residuals (n_obs, 2) in px, over their relative sigmas."""
-    relative = problem.observations.relative_sigma
+    """Lengths (n_obs,) of residuals (n_obs, 2) in px, over their relative sigmas and shapes."""
+    seen = problem.observations
+    if seen.relative_sigma is not None or seen.noise_shape is not None:
+        residuals = whitened(residuals, seen.whitening)
     lengths: FloatArray = np.linalg.norm(residuals, axis=1)
-    return lengths if relative is None else lengths / relative
+    return lengths
 
 
 def left_by_frame(in_frame: IntArray) -> FloatArray:
@@ -146,30 +149,41 @@ def left_by_frame(in_frame: IntArray) -> FloatArray:
     return result
 
 
+NoiseKind = Literal["keypoints", "matched", "board"]
+
+
 @dataclass(frozen=True)
 class NoiseClass:
-    """Observations of one camera whose keypoints are about equally large, and their noise."""
+    """Observations of one camera whose keypoints are about equally large, and their noise.
+
+    Of matched ones: whose matching states about the same sigma.
+    """
 
     camera: int
-    smallest_px: float  # scale of the keypoints, from
+    smallest_px: float  # scale of the keypoints, or sigma that their matching states, from
     largest_px: float  # to
     count: int
     sigma_px: float  # robust, of one coordinate
-    of_board: bool = False
+    kind: NoiseKind = "keypoints"
+
+    @property
+    def of_board(self) -> bool:
+        return self.kind == "board"
 
 
 def noise_classes(
     problem: Problem, residuals: FloatArray, options: GraphOptions | None = None
 ) -> tuple[NoiseClass, ...]:
     """The noise of each camera by the size of its keypoints, from residuals (n_obs, 2) in px."""
-    lengths = np.linalg.norm(residuals, axis=1) / np.sqrt(redundancies(problem, options))
-    size, found = problem.observations.feature_scale, []
-    for camera, rows, of_board in _classes(problem, np.isfinite(lengths)):
+    seen, found = problem.observations, []
+    lengths = residual_lengths(problem, residuals) / np.sqrt(redundancies(problem, options))
+    if seen.relative_sigma is not None:
+        lengths *= seen.relative_sigma
+    for camera, rows, kind in _classes(problem, np.isfinite(lengths)):
         sigma_px = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN
-        ends = (0.0, np.inf)
-        if size is not None and not of_board:
-            ends = (float(size[rows].min()), float(size[rows].max()))
-        found.append(NoiseClass(camera, *ends, len(rows), sigma_px, of_board))
+        by = {"matched": seen.matched_sigma_px, "keypoints": seen.feature_scale}.get(kind)
+        ends = (0.0, np.inf) if by is None else (float(by[rows].min()), float(by[rows].max()))
+        found.append(NoiseClass(camera, *ends, len(rows), sigma_px, kind))
     return tuple(found)
 
 
@@ -197,33 +211,42 @@ def with_class_sigmas(
 
 def _classes(
     problem: Problem, projected: NDArray[np.bool_]
-) -> Iterator[tuple[int, IntArray, bool]]:
-    """Camera and rows of each class, and whether it is of a board: half octaves of keypoint size,
-    joined until large enough, and the corners of the board.
+) -> Iterator[tuple[int, IntArray, NoiseKind]]:
+    """Camera, rows and kind of each class: half octaves of keypoint size, or of the sigma that
+    matching states, joined until large enough, and the corners of the board.
 
     Observations that are not `projected` (n_obs,), and where some sizes are known those whose size
     is not, as those of clicked marks, are in none.
     """
     seen = problem.observations
     of_board = problem.known[seen.point]
+    matched = np.zeros(len(seen), dtype=bool)
+    if seen.matched_sigma_px is not None:
+        matched = np.isfinite(seen.matched_sigma_px)
     for camera in range(len(problem.initial.cameras)):
         own = (seen.camera == camera) & projected
         if (own & of_board).sum() >= BOARD_CLASS_SIZE:
-            yield camera, np.flatnonzero(own & of_board), True
-        rows = np.flatnonzero(own & ~of_board)
-        if seen.feature_scale is not None and np.isfinite(seen.feature_scale).any():
-            rows = rows[seen.feature_scale[rows] > 0]
-            half_octave = np.floor(2 * np.log2(seen.feature_scale[rows]))
-            rows = rows[np.argsort(half_octave, kind="stable")]
-            edges = np.flatnonzero(np.diff(np.sort(half_octave))) + 1
-        else:
-            edges = np.empty(0, np.int64)
-        begin = 0
-        for end in [*edges.tolist(), len(rows)]:
-            left = len(rows) - end
-            if (end - begin >= CLASS_SIZE and left >= CLASS_SIZE) or (left == 0 and end > begin):
-                yield camera, rows[begin:end], False
-                begin = end
+            yield camera, np.flatnonzero(own & of_board), "board"
+        for rows in _half_octaves(np.flatnonzero(own & matched), seen.matched_sigma_px):
+            yield camera, rows, "matched"
+        for rows in _half_octaves(np.flatnonzero(own & ~of_board & ~matched), seen.feature_scale):
+            yield camera, rows, "keypoints"
+
+
+def _half_octaves(rows: IntArray, size: FloatArray | None) -> Iterator[IntArray]:
+    """The rows by half octaves of their size (n_obs,), those of too few with the next larger."""
+    edges: list[int] = []
+    if size is not None and np.isfinite(size).any():
+        rows = rows[size[rows] > 0]
+        half_octave = np.floor(2 * np.log2(size[rows]))
+        rows = rows[np.argsort(half_octave, kind="stable")]
+        edges = (np.flatnonzero(np.diff(np.sort(half_octave))) + 1).tolist()
+    begin = 0
+    for end in [*edges, len(rows)]:
+        left = len(rows) - end
+        if (end - begin >= CLASS_SIZE and left >= CLASS_SIZE) or (left == 0 and end > begin):
+            yield rows[begin:end]
+            begin = end
 
 
 def with_click_sigma(problem: Problem, sigma_px: float) -> Problem:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,35 @@ class Observations:
     point: IntArray  # (n_obs,) index into Estimate.points
     relative_sigma: FloatArray | None = None  # (n_obs,) of each pixel's noise; None: all the same
     feature_scale: FloatArray | None = None  # (n_obs,) size of each keypoint in px; NaN: unknown
+    noise_shape: FloatArray | None = None  # (n_obs, 2, 2) of determinant 1; None: all are round
+    # (n_obs,) what the matching of its patch says of each; NaN: of a keypoint as it was found
+    matched_sigma_px: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def subset(self, keep: NDArray[np.bool_]) -> Observations:
-        sigma, scale = (
-            None if each is None else each[keep]
-            for each in (self.relative_sigma, self.feature_scale)
-        )
-        return Observations(
-            self.pixels[keep], self.frame[keep], self.camera[keep], self.point[keep], sigma, scale
-        )
+    def subset(self, keep: BoolArray | IntArray) -> Observations:
+        """Some of them, by a mask or by their rows."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        kept: dict[str, Any] = {k: None if v is None else v[keep] for k, v in columns.items()}
+        return Observations(**kept)
+
+    @property
+    def whitening(self) -> FloatArray:
+        """Upper triangles (n_obs, 3) that turn pixel errors into round ones of equal size.
+
+        With a, b, c of an observation, errors x, y become a x + b y and c y, whose covariance is
+        that of an observation whose noise is round and whose relative sigma is 1.
+        """
+        n = len(self)
+        result = np.zeros((n, 3))
+        if self.noise_shape is None:
+            result[:, [0, 2]] = 1.0
+        else:
+            down = np.sqrt(self.noise_shape[:, 1, 1])
+            result[:, 0], result[:, 2] = down, 1 / down
+            result[:, 1] = -self.noise_shape[:, 0, 1] / down
+        return result if self.relative_sigma is None else result / self.relative_sigma[:, None]
 
 
 def images_seen(observations: Observations) -> IntArray:
@@ -49,12 +66,12 @@ def images_seen(observations: Observations) -> IntArray:
 def joined(parts: Sequence[Observations]) -> Observations:
     """All observations of several sets, one set after the other."""
 
-    def column(name: str, missing: float) -> FloatArray | None:
+    def column(name: str, missing: float | FloatArray) -> FloatArray | None:
         given = [getattr(part, name) for part in parts]
         if all(one is None for one in given):
             return None
         filled = (
-            np.full(len(part), missing) if one is None else one
+            np.full((len(part), *np.shape(missing)), missing) if one is None else one
             for part, one in zip(parts, given, strict=True)
         )
         return np.concatenate(list(filled))
@@ -66,6 +83,8 @@ def joined(parts: Sequence[Observations]) -> Observations:
         np.concatenate([part.point for part in parts]),
         column("relative_sigma", 1.0),
         column("feature_scale", np.nan),
+        column("noise_shape", np.eye(2)),
+        column("matched_sigma_px", np.nan),
     )
 
 
@@ -251,6 +270,12 @@ def points_in_cameras(estimate: Estimate, observations: Observations) -> FloatAr
     in_rig += rig_translation[observations.frame]
     in_cam = np.einsum("nij,nj->ni", cam_rotation[observations.camera], in_rig)
     return in_cam + cam_translation[observations.camera]
+
+
+def whitened(values: FloatArray, whitening: FloatArray) -> FloatArray:
+    """Pixel errors, or rows that lead to them, (n, 2, ...) by upper triangles (n, 3)."""
+    a, b, c = (one.reshape(-1, *[1] * (values.ndim - 2)) for one in whitening.T)
+    return np.stack([a * values[:, 0] + b * values[:, 1], c * values[:, 1]], axis=1)
 
 
 def residuals_px(estimate: Estimate, observations: Observations) -> FloatArray:

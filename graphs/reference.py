@@ -13,7 +13,7 @@ import gtsam
 import gtsam_unstable
 import numpy as np
 
-from graphs.build import GraphOptions, rig_prior_factor
+from graphs.build import GraphOptions, rig_prior_factor, root_information
 from graphs.camera import Camera
 from graphs.frames import NOT_SMART, FloatArray, from_gtsam_inverse, to_gtsam_inverse
 from graphs.gauge import add_gauge
@@ -68,7 +68,7 @@ def native_prior_factor(index: int, camera: Camera, prior: LensPrior) -> gtsam.N
 
 
 def add_observations(
-    graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: gtsam.noiseModel.Base
+    graph: gtsam.NonlinearFactorGraph, problem: Problem, options: GraphOptions
 ) -> None:
     """Append one factor an observation, in the order of the observations."""
     kinds = [
@@ -78,8 +78,9 @@ def add_observations(
         for camera in problem.initial.cameras
     ]
     seen = problem.observations
-    rows = zip(seen.pixels, seen.frame, seen.camera, seen.point, strict=True)
-    for pixel, frame, camera, point in rows:
+    noises = (observation_noise(root, options) for root in root_information(problem, options))
+    rows = zip(seen.pixels, noises, seen.frame, seen.camera, seen.point, strict=True)
+    for pixel, noise, frame, camera, point in rows:
         graph.push_back(
             kinds[camera](
                 pixel, noise, frame_key(frame), rig_key(camera), point_key(point), lens_key(camera)
@@ -101,7 +102,7 @@ def build_reference(problem: Problem, options: GraphOptions) -> ReferenceGraph:
     cameras = problem.initial.cameras
     priors = options.lens_priors or tuple(weak_lens_prior(camera) for camera in cameras)
     factors = gtsam.NonlinearFactorGraph()
-    add_observations(factors, problem, observation_noise(options))
+    add_observations(factors, problem, options)
     for index, (camera, prior) in enumerate(zip(cameras, priors, strict=True)):
         factors.add(native_prior_factor(index, camera, prior))
     for index, rig_prior in options.rig_priors.items():
@@ -137,9 +138,10 @@ def solve_reference(
     return reference_estimate(values, graph.problem), values, optimizer.iterations()
 
 
-def observation_noise(options: GraphOptions) -> gtsam.noiseModel.Base:
-    """Isotropic pixel noise under the chosen robust loss."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, options.sigma_px)
+def observation_noise(root: FloatArray, options: GraphOptions) -> gtsam.noiseModel.Base:
+    """Pixel noise of a root information, its upper triangle (3,), under the robust loss."""
+    a, b, c = root
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.array([[a, b], [0.0, c]]), NOT_SMART)
     if options.loss == "none":
         return noise
     kinds = {

@@ -176,25 +176,27 @@ def point_rows(
     rig_centre: FloatArray,
     cam_rotation: FloatArray,
     cam_centre: FloatArray,
-    root_information: FloatArray,  # (n_obs,)
+    root_information: FloatArray,  # (n_obs, 3) upper triangles by rows
     by_point: FloatArray,  # (n, 2, 3) by the point in the camera
     of_point: FloatArray,  # out (n, 2, 3) by the point's own directions, whitened
 ) -> None:
     """Rows by the points alone, for triangulation."""
-    basis, e = np.empty((2, 3)), np.empty(3)
+    basis, e, Jq = np.empty((2, 3)), np.empty(3), np.empty((2, 3))
     before = -1
     for i in range(n):
         o, j, f, c = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
         if j != before:
             bearing_basis(points[j], basis)
             before = j
+        w00, w01, w11 = root_information[o]
+        for k in range(3):
+            Jq[0, k] = w00 * by_point[i, 0, k] + w01 * by_point[i, 1, k]
+            Jq[1, k] = w11 * by_point[i, 1, k]
         for a in range(2):
             _by_rig_and_point(
-                by_point[i, a], cam_rotation[c], rig_rotation[f], basis, anchors[j],
-                rig_centre[f], cam_centre[c], e, of_point[i, a],
+                Jq[a], cam_rotation[c], rig_rotation[f], basis, anchors[j], rig_centre[f],
+                cam_centre[c], e, of_point[i, a],
             )  # fmt: skip
-            for k in range(3):
-                of_point[i, a, k] *= root_information[o]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -221,7 +223,7 @@ def all_rows(
 ) -> None:
     """Weighted rows by everything that an observation depends on.
 
-    With S^T S = weight (1 + bend r r^T), the curvature of the loss, rows J become S J and
+    With S^T S = weight (1 + bend r r^T), the curvature of the loss, whitened rows J become S J and
     residuals S^-T weight r (Triggs et al., Bundle adjustment: a modern synthesis, 2000, 4.3).
     """
     basis, e, Jq = np.empty((2, 3)), np.empty(3), np.empty((2, 3))
@@ -235,15 +237,18 @@ def all_rows(
         r0, r1 = residuals[i, 0], residuals[i, 1]
         root, along = np.sqrt(weights[i]), np.sqrt(1.0 + bends[i] * (r0 * r0 + r1 * r1))
         residuals[i, 0], residuals[i, 1] = r0 * root / along, r1 * root / along
-        beta, root = bends[i] / (1.0 + along), root * root_information[o]
-        s01 = root * beta * r0 * r1
-        s00, s11 = root * (1 + beta * r0 * r0), root * (1 + beta * r1 * r1)
+        beta = bends[i] / (1.0 + along)
+        w00, w01, w11 = root_information[o]
+        across = root * beta * r0 * r1
+        first, second = root * (1 + beta * r0 * r0), root * (1 + beta * r1 * r1)
+        s00, s01 = first * w00, first * w01 + across * w11
+        s10, s11 = across * w00, across * w01 + second * w11
         for k in range(3):
             Jq[0, k] = s00 * by_point[i, 0, k] + s01 * by_point[i, 1, k]
-            Jq[1, k] = s01 * by_point[i, 0, k] + s11 * by_point[i, 1, k]
+            Jq[1, k] = s10 * by_point[i, 0, k] + s11 * by_point[i, 1, k]
         for k in range(by_params.shape[2]):
             x, y = by_params[i, 0, k], by_params[i, 1, k]
-            by_params[i, 0, k], by_params[i, 1, k] = s00 * x + s01 * y, s01 * x + s11 * y
+            by_params[i, 0, k], by_params[i, 1, k] = s00 * x + s01 * y, s10 * x + s11 * y
         for a in range(2):
             _by_rig_and_point(
                 Jq[a], cam_rotation[c], rig_rotation[f], basis, anchors[j], rig_centre[f],

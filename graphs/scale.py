@@ -45,7 +45,7 @@ def scale_factor(
     loss: LossName,
     loss_scale: float,
 ) -> gtsam.NonlinearFactor:
-    """A scale source of the problem as a factor; root_information (n_obs,) 1 / sigma of a pixel."""
+    """A scale source of the problem as a factor; root_information (n_obs, 3) of pixels."""
     if not isinstance(scale, KnownSpan):
         return range_factor(scale)
     return _Span(problem, scale, root_information, lens_of, loss, loss_scale).factor()

@@ -32,16 +32,22 @@ def select_tracks(problem: Problem, min_parallax_deg: float) -> Problem:
 
     Raises NoParallaxError when nothing is left.
     """
-    seen = problem.observations
-    length = np.bincount(seen.point, minlength=len(problem.initial.points))
-    keep = (length >= MIN_TRACK_LENGTH) & (parallax_deg(problem) >= min_parallax_deg)
-    keep = np.where(problem.known, _in_enough_company(problem), keep)
+    keep = well_seen(problem, min_parallax_deg)
     if not keep.any():
         raise NoParallaxError(
-            f"none of {len(length)} points is seen {MIN_TRACK_LENGTH} times with "
+            f"none of {len(keep)} points is seen {MIN_TRACK_LENGTH} times with "
             f"{min_parallax_deg:g} deg of parallax: move the camera sideways, closer to things"
         )
+    seen = problem.observations
     return compact(problem, seen.subset(keep[seen.point]))
+
+
+def well_seen(problem: Problem, min_parallax_deg: float) -> BoolArray:
+    """Points (n_points,) with tracks that are long enough, and seen from far enough apart."""
+    length = np.bincount(problem.observations.point, minlength=len(problem.initial.points))
+    keep = (length >= MIN_TRACK_LENGTH) & (parallax_deg(problem) >= min_parallax_deg)
+    result: BoolArray = np.where(problem.known, _in_enough_company(problem), keep)
+    return result
 
 
 def _in_enough_company(problem: Problem) -> BoolArray:

@@ -101,22 +101,13 @@ def _placed(
     """Points, and of the rows `which` those that agree with the point of their owner."""
     point = np.unique(owner, return_inverse=True)[1]
     points = nearest_points(centres[which], rays[which], point)
-    trial = replace(_at(seen, which), point=point)
+    trial = replace(seen.subset(which), point=point)
     errors = np.linalg.norm(residuals_px(replace(estimate, points=points), trial), axis=1)
     good = _best_of_each_image(trial, errors)
     good &= np.bincount(point[good], minlength=len(points))[point] >= 2
     kept: IntArray = np.flatnonzero(good)
     found, point = np.unique(point[kept], return_inverse=True)
-    return points[found], replace(_at(seen, which[kept]), point=point), kept
-
-
-def _at(seen: Observations, rows: IntArray) -> Observations:
-    sigma, scale = (
-        None if each is None else each[rows] for each in (seen.relative_sigma, seen.feature_scale)
-    )
-    return Observations(
-        seen.pixels[rows], seen.frame[rows], seen.camera[rows], seen.point[rows], sigma, scale
-    )
+    return points[found], replace(seen.subset(which[kept]), point=point), kept
 
 
 def _best_of_each_image(seen: Observations, errors: FloatArray) -> BoolArray:

@@ -17,7 +17,7 @@ from graphs.frames import FloatArray
 from graphs.jackknife import change, tangent
 from graphs.joint_prior import believed, centred_covariance, displaced, parameters
 from graphs.model_covariance import calibration_columns
-from graphs.noise import redundancies
+from graphs.noise import redundancies, residual_lengths
 from graphs.problem import BoardPoints, Estimate, PriorRig, Problem, residuals_px
 from graphs.refine import Refinement, refine
 from graphs.scale import length_of
@@ -85,19 +85,19 @@ def certify(
 def twin_problem(refinement: Refinement, rng: np.random.Generator) -> Problem:
     """The optimum seen anew: exact projections, and lengths of noise drawn from the residuals'.
 
-    Directions are drawn evenly, each length is scaled by the sigma of its observation, and
-    each measured distance errs by its sigma, as does an earlier calibration that is believed.
+    Directions are drawn evenly, each error is scaled and shaped as the noise of its observation,
+    and each measured distance errs by its sigma, as does an earlier calibration that is believed.
     """
     problem, estimate = refinement.problem, refinement.estimate
     seen = problem.observations
     left = residuals_px(estimate, seen)
     good = np.isfinite(left[:, 0])
-    relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma
     before_fit = np.sqrt(redundancies(problem, refinement.graph.options))
-    lengths = (np.linalg.norm(left, axis=1) / relative / before_fit)[good]
-    drawn = rng.choice(lengths, len(seen)) * relative
+    drawn = rng.choice((residual_lengths(problem, left) / before_fit)[good], len(seen))
     angle = rng.uniform(0, 2 * np.pi, len(seen))
-    noise = drawn[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    a, b, c = seen.whitening.T
+    y = drawn * np.sin(angle) / c
+    noise = np.column_stack([(drawn * np.cos(angle) - b * y) / a, y])
     exact = np.where(good[:, None], seen.pixels + left, seen.pixels)
     scales = tuple(
         replace(one, length_m=length_of(one, estimate) + one.sigma_m * rng.standard_normal())

@@ -24,7 +24,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan, read_scan
-from sfm_calib.mapping import map_scan
+from sfm_calib.mapping import Mapped, map_scan
 from sfm_calib.nominal import (
     check_config,
     known_cameras,
@@ -35,6 +35,7 @@ from sfm_calib.nominal import (
     shared_lenses,
     start_from_config,
 )
+from sfm_calib.refine import refine_tracks
 from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
@@ -103,8 +104,27 @@ def mapped_scan(
     lenses = [lens_of(config, name, len(scan.cameras)) for name in scan.cameras]
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
+    mapped = remeasured(mapped, scan, config, cache, progress, watch)
     given = Given(scan, config, mapped, command)
     return given, start_from_config(mapped.problem, config)
+
+
+def remeasured(
+    mapped: Mapped,
+    scan: Scan,
+    config: RigConfig,
+    cache: Cache,
+    progress: Progress,
+    watch: Stopwatch,
+) -> Mapped:
+    """What was mapped with its tracks measured anew, where the configuration asks for it."""
+    if not config.refine:
+        return mapped
+    with watch.stage("matching patches"), refusals(mapped.problem):
+        options = options_of(mapped.problem, config)
+        refined = refine_tracks(mapped.problem, scan, options, config, cache, progress)
+    messages = (*mapped.messages, refined.message)
+    return replace(mapped, problem=refined.problem, messages=messages)
 
 
 def determine(given: Given, problem: Problem, watch: Stopwatch, progress: Progress) -> Outcome:

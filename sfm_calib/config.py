@@ -74,6 +74,10 @@ class Options(SolveOptions):
     """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
     """SIFT features an image, at most: 100 to 50000."""
+    refine: bool = False
+    """Measure every track anew, by matching its patches: to hundredths of a pixel (needs torch)."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where torch computes."""
     min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
     """Points seen under a smaller angle are left out: they say little and harm the solve."""
     max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS

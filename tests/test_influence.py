@@ -74,7 +74,7 @@ def test_shared_errors_are_those_of_dense_algebra(
     seen = replace(problem.observations, relative_sigma=sigma)
     graph = build(replace(problem, observations=seen), GraphOptions(SIGMA_PX, loss, 2.0))
     estimate, values, _ = solve(graph)
-    dense = linearise_dense(graph, values, estimate.points, SIGMA_PX * sigma)
+    dense = linearise_dense(graph, values, estimate.points)
     lengths = np.linalg.norm(dense.residuals, axis=1)
     weights = weight_and_slope(loss, 2.0, lengths)[0]
     H = dense.normal_equations(weights, weights[:, None, None] * np.eye(2))[0]

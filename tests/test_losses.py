@@ -39,7 +39,7 @@ def weighed(
     """Whitened residuals (n, 2), weights, bends and costs (n,) of pixels observed at (7, 5)."""
     n = len(projected)
     residuals, weights, bends, costs = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
-    observed, root = np.tile([7.0, 5.0], (n, 1)), np.full(n, 1 / sigma_px)
+    observed, root = np.tile([7.0, 5.0], (n, 1)), np.tile([1.0, 0.0, 1.0], (n, 1)) / sigma_px
     weigh_many(LOSS_INDEX[loss], scale, projected, observed, root, residuals, weights, bends, costs)
     return residuals, weights, bends, costs
 

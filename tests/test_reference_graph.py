@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from synthetic.bundle_adjustment import bundle_adjust
-from synthetic.problems import calibration_of
+from synthetic.problems import calibration_of, with_noise
 
 from graphs.build import NO_KNOWLEDGE, CalibrationGraph, GraphOptions, build
 from graphs.clusters import homogeneous
@@ -80,16 +80,24 @@ def options_of(loss: LossName, priors: tuple[LensPrior, ...] = ()) -> GraphOptio
 
 @cache
 def solved(
-    lens: LensName, loss: LossName, weak: bool = False, baseline: bool = False, near: bool = False
+    lens: LensName,
+    loss: LossName,
+    weak: bool = False,
+    baseline: bool = False,
+    near: bool = False,
+    differing: bool = False,
 ) -> Solved:
     """weak: with the priors that a calibration has; baseline: with a measured one; near: starts
-    at the truth, with noise that puts nothing out of sight of a loss that has several optima."""
+    at the truth, with noise that puts nothing out of sight of a loss that has several optima;
+    differing: observations state noise of all sizes and shapes."""
     changes = {"lens": lens, "baseline_sigma_m": 5e-4 * baseline}
     if near:
         changes |= {"outlier_share": 0.0, "sigma_px": SIGMA_PX / 2, "min_track_length": 4}
     problem, true = simulate_tracks(SMALL.model_copy(update=changes), np.random.default_rng(20))
     if near:
         problem = replace(problem, initial=true)
+    if differing:
+        problem = replace(problem, observations=with_noise(problem.observations))
     options = options_of(loss, () if weak else no_knowledge(problem))
     graph = build(problem, options)
     estimate, values, summary = solve(graph, relative_tolerance=1e-14)
@@ -149,17 +157,19 @@ def assert_same_optimum(ours: Estimate, theirs: Estimate, sigma: FloatArray) -> 
     assert (np.abs(a - b) <= 1e-6 * np.abs(b) + 1e-5 * sigma + 1e-9).all()
 
 
-# every lens with every loss, and each of them once with a measured baseline
-ALL = [(lens, loss, False) for lens in NATIVE_LENSES for loss in LOSS_NAMES]
-ALL += [(lens, loss, True) for lens, loss in zip(NATIVE_LENSES, LOSS_NAMES, strict=True)]
+# every lens with every loss, each of them once with a measured baseline, and losses once with
+# observations whose noise differs in size and shape
+ALL = [(lens, loss, False, False) for lens in NATIVE_LENSES for loss in LOSS_NAMES]
+ALL += [(lens, loss, True, False) for lens, loss in zip(NATIVE_LENSES, LOSS_NAMES, strict=True)]
+ALL += [("radtan", loss, False, True) for loss in LOSS_NAMES]
 
 
-@pytest.mark.parametrize(("lens", "loss", "baseline"), ALL)
+@pytest.mark.parametrize(("lens", "loss", "baseline", "differing"), ALL)
 def test_our_optimum_is_one_of_the_reference(
-    lens: LensName, loss: LossName, baseline: bool
+    lens: LensName, loss: LossName, baseline: bool, differing: bool
 ) -> None:
     """GTSAM's Gauss-Newton on its own factors, started there, stays there."""
-    case = solved(lens, loss, weak=True, baseline=baseline, near=True)
+    case = solved(lens, loss, weak=True, baseline=baseline, near=True, differing=differing)
     theirs = reference_estimate(case.native, case.graph.problem)
     assert_same_optimum(case.estimate, theirs, sigmas_of(case))
     assert case.reference.factors.error(case.native) == pytest.approx(case.summary.cost, rel=1e-9)
@@ -295,12 +305,12 @@ def test_the_model_covariance_is_the_dense_inverse(lens: LensName, loss: LossNam
     assert worst_difference(case.covariance.model.matrix, expected) < 1e-5
 
 
-@pytest.mark.parametrize(("lens", "loss", "baseline"), ALL)
+@pytest.mark.parametrize(("lens", "loss", "baseline", "differing"), ALL)
 def test_our_marginals_are_those_of_the_reference(
-    lens: LensName, loss: LossName, baseline: bool
+    lens: LensName, loss: LossName, baseline: bool, differing: bool
 ) -> None:
     """All sigmas and cross-covariances of lenses and rig, before the loss's moments are in."""
-    case = solved(lens, loss, weak=True, baseline=baseline, near=True)
+    case = solved(lens, loss, weak=True, baseline=baseline, near=True, differing=differing)
     keys = calibration_keys(case.graph)
     joint = gtsam.Marginals(case.reference.factors, case.native).jointMarginalCovariance(keys)
     native = np.block([[joint.at(a, b) for b in keys] for a in keys])

@@ -12,13 +12,11 @@ from synthetic.problems import small_problem
 from graphs.build import CalibrationGraph, GraphOptions, build, root_information
 from graphs.clusters import homogeneous
 from graphs.frames import FloatArray, log_rotation
-from graphs.gauge import add_gauge
 from graphs.influence import responses
 from graphs.keys import frame_key, lens_key, rig_key
 from graphs.lenses import LensName
 from graphs.losses import LOSS_NAMES, SCALE_95, LossName
 from graphs.noise import loss_moments, robust_sigma_px, with_click_sigma
-from graphs.priors import weak_lens_prior
 from graphs.problem import (
     Estimate,
     KnownBaseline,
@@ -30,13 +28,8 @@ from graphs.problem import (
 )
 from graphs.reference import (
     ReferenceGraph,
-    add_observations,
     build_reference,
-    native_prior_factor,
-    native_scale_factor,
     native_slots,
-    native_values,
-    observation_noise,
     solve_reference,
 )
 from graphs.scale import length_of, total_sigma_m
@@ -73,24 +66,6 @@ def options_of(loss: LossName = "none") -> GraphOptions:
 
 
 # ---- against GTSAM's own factors ------------------------------------------------------------
-
-
-def reference_of(problem: Problem, options: GraphOptions) -> ReferenceGraph:
-    """`build_reference`, with clicks under a noise of their own."""
-    seen = problem.observations
-    if seen.relative_sigma is None:
-        return build_reference(problem, options)
-    factors = gtsam.NonlinearFactorGraph()
-    for relative in np.unique(seen.relative_sigma):
-        own = replace(problem, observations=seen.subset(seen.relative_sigma == relative))
-        noise = observation_noise(replace(options, sigma_px=relative * options.sigma_px))
-        add_observations(factors, own, noise)
-    for index, camera in enumerate(problem.initial.cameras):
-        factors.add(native_prior_factor(index, camera, weak_lens_prior(camera)))
-    add_gauge(factors, problem)
-    for source in problem.scales:
-        factors.add(native_scale_factor(source))
-    return ReferenceGraph(problem, factors, native_values(problem))
 
 
 def keys_of(problem: Problem) -> list[int]:
@@ -145,7 +120,7 @@ def test_optimum_and_marginals_are_gtsams(
     problem, _ = measured(source, lens)
     graph = build(problem, options_of(loss))
     estimate, values, summary = solve(graph, relative_tolerance=1e-14)
-    reference = reference_of(problem, options_of(loss))
+    reference = build_reference(problem, options_of(loss))
     theirs, native, _ = solve_reference(reference)
     assert summary.converged
     assert summary.cost == pytest.approx(reference.factors.error(native), rel=1e-8)

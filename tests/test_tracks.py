@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from synthetic.dense import linearise_dense, moved, of_others, track_columns, whole
-from synthetic.problems import projected, small_problem, with_tracks
+from synthetic.problems import projected, small_problem, with_noise, with_tracks
 
 from graphs import clusters
 from graphs.build import CalibrationGraph, GraphOptions, build
@@ -149,8 +149,7 @@ def test_so_it_is_with_three_cameras_whichever_is_the_reference(reference: int) 
 
 def test_so_it_is_where_cameras_share_a_lens_and_observations_differ() -> None:
     problem, _ = small_problem("radtan", cameras=3, points=20)
-    sigma = np.random.default_rng(0).uniform(0.5, 3, len(problem.observations))
-    seen = replace(problem.observations, relative_sigma=sigma)
+    seen = with_noise(problem.observations)
     options = options_of("cauchy", shared_lenses=((0, 2),))
     assert_gradient_is_right(case_of(replace(problem, observations=seen), options))
 
@@ -248,17 +247,11 @@ def test_points_are_where_they_cost_least(loss: LossName) -> None:
 # ---- the Hessian ---------------------------------------------------------------------------
 
 
-def sigma_of(problem: Problem) -> FloatArray:
-    relative = problem.observations.relative_sigma
-    return SIGMA_PX * (np.ones(len(problem.observations)) if relative is None else relative)
-
-
 def assert_hessian_is_right(case: Case, newton: bool) -> None:
     """Against J^T C J with every point in it, which are then eliminated by a dense Schur
     complement. C: the loss's weight or, for Newton, its curvature."""
     graph, options = case.graph, case.graph.options
-    sigma_px = sigma_of(graph.problem)
-    dense = linearise_dense(graph, case.state.values, case.points, sigma_px)
+    dense = linearise_dense(graph, case.state.values, case.points)
     weight, curvature = slope_and_curvature(options.loss, options.loss_scale, dense.residuals)
     used = with_least_curvature(curvature, weight) if newton else weight[:, None, None] * np.eye(2)
     H, g = dense.normal_equations(weight, used)
@@ -299,8 +292,7 @@ def test_the_hessian_is_right_for_every_lens(lens: LensName) -> None:
 
 def test_the_hessian_is_right_where_cameras_share_a_lens_and_observations_differ() -> None:
     problem, _ = small_problem("radtan", cameras=3, reference=1)
-    sigma = np.random.default_rng(0).uniform(0.5, 3, len(problem.observations))
-    seen = replace(problem.observations, relative_sigma=sigma)
+    seen = with_noise(problem.observations)
     options = options_of("cauchy", shared_lenses=((0, 2),))
     assert_hessian_is_right(case_of(replace(problem, observations=seen), options), newton=False)
 

@@ -100,7 +100,7 @@ def test_derivatives_are_those_of_the_residuals() -> None:
     n_points, points = len(problem.initial.points), problem.initial.points
     exact = dense_squares(graph, graph.initial, points, np.longdouble)
     A = (exact.A * exact.scale).astype(float)[: 2 * len(problem.observations)]
-    about = linearise_dense(graph, graph.initial, points, np.full(len(problem.observations), 0.5))
+    about = linearise_dense(graph, graph.initial, points)
     seen, width = problem.observations, graph.layout.elimination.n_columns
     differences = np.zeros((len(seen), 2, 3 * n_points + width))
     for row, point in enumerate(seen.point):

@@ -104,14 +104,21 @@ class Dense:
         return followed
 
 
-def linearise_dense(
-    graph: CalibrationGraph, values: gtsam.Values, points: FloatArray, sigma_px: FloatArray
-) -> Dense:
-    """Central differences about values and scene points (n_points, 3); sigma_px (n_obs,)."""
+def cov_px(graph: CalibrationGraph) -> FloatArray:
+    """Covariance (n_obs, 2, 2) of each observation, as its parts say."""
     seen = graph.problem.observations
+    relative = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma
+    shape = np.eye(2) if seen.noise_shape is None else seen.noise_shape
+    return (graph.options.sigma_px * relative[:, None, None]) ** 2 * shape
+
+
+def linearise_dense(graph: CalibrationGraph, values: gtsam.Values, points: FloatArray) -> Dense:
+    """Central differences about values and scene points (n_points, 3)."""
+    seen = graph.problem.observations
+    root = np.linalg.cholesky(np.linalg.inv(cov_px(graph))).mT
 
     def residuals(at: gtsam.Values, of: FloatArray) -> FloatArray:
-        return residuals_px(estimate_at(graph, at, of), seen) / sigma_px[:, None]
+        return np.einsum("nij,nj->ni", root, residuals_px(estimate_at(graph, at, of), seen))
 
     h = steps(graph, values)
     by_variables = np.zeros((len(seen), 2, len(h)))

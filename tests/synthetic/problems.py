@@ -150,3 +150,15 @@ def calibration_of(estimate: Estimate) -> FloatArray:
     """All lens parameters, then all rotations and translations of cam_from_rig (n,)."""
     placed = [np.append(t.rotation.ravel(), t.translation) for t in estimate.cam_from_rig]
     return np.concatenate([*(camera.params for camera in estimate.cameras), *placed])
+
+
+def with_noise(seen: Observations, seed: int = 0) -> Observations:
+    """The observations with noise of all sizes and shapes stated of them."""
+    rng = np.random.default_rng(seed)
+    roots = rng.uniform(-1, 1, (len(seen), 2, 2)) + 1.5 * np.eye(2)
+    shapes = roots @ roots.mT
+    return replace(
+        seen,
+        relative_sigma=rng.uniform(0.5, 3, len(seen)),
+        noise_shape=shapes / np.sqrt(np.linalg.det(shapes))[:, None, None],
+    )

@@ -1,0 +1,254 @@
+"""The patches of tracks aligned to each other: least-squares matching of all views at once.
+
+Each view's patch is warped by an affine change of the reference's samples, its brightness scaled
+and shifted, until it is like the mean of its track's patches (Gruen, Adaptive least squares
+correlation, 1985; of many views: Gruen and Baltsavias, 1988). The gradients are the mean's, so that
+a step costs one look at each image (Baker and Matthews, IJCV 2004, the inverse composition), and
+the noise of one image does not bend them. Samples that differ much from the mean, as what stands
+before a surface or shines on it does, count less.
+
+The mean includes the reference, which moves with the others: where a track's patches lie on its
+surface is a matter of taste, and the scene point follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphs.frames import FloatArray
+from graphs.problem import BoolArray, IntArray
+from sfm_calib.patches.crops import SIDE, Crops
+from sfm_calib.patches.warps import HALF
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+STEPS = 8  # four or five bring nine in ten to rest
+AT_REST = 0.008  # samples: a fifth of what noise leaves, and the next step is far smaller
+MOST_SHIFT, MOST_AFFINE = 1.0, 0.15  # a step, in samples and per sample
+LEAST_LIKE = 0.6  # correlation of a view that counts in the mean
+# Residuals this many times the rms of their view count half: few of its samples may differ.
+ODD = 6.0**0.5
+AFFINE_PRIOR = 0.25  # sigma: surfaces slope, but what shears a patch into a line is an edge's slide
+LEAST_CONTRAST = 0.5  # grey levels: sensor noise alone has more
+WIDTH = 2 * HALF + 1
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Where a batch's patches came to lie."""
+
+    pixels: FloatArray  # (n, 2) from the middles, in image pixels
+    cov_px: FloatArray  # (n, 2, 2) of each by itself, from its image's noise
+    likeness: FloatArray  # (n,) correlation with the mean of the other views
+
+
+class _Batch:
+    """Tensors of one batch, and what is computed of them."""
+
+    def __init__(
+        self, torch: Any, crops: Crops, track: IntArray, reference: BoolArray, device: str
+    ) -> None:
+        def tensor(values: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values)).to(device, torch.float32)
+
+        self.torch = torch
+        self.images = tensor(crops.pixels)[:, None]
+        self.edges = tensor(crops.inside)
+        self.middle, self.warp = tensor(crops.middle), tensor(crops.coefficients)
+        self.track = torch.from_numpy(np.unique(track, return_inverse=True)[1]).to(device)
+        self.reference = torch.from_numpy(reference).to(device)
+        self.n_tracks = int(self.track.max()) + 1
+        ends = torch.arange(-HALF - 1, HALF + 2, device=device, dtype=torch.float32)
+        y, x = torch.meshgrid(ends, ends, indexing="ij")
+        self.grid = torch.stack([x.ravel(), y.ravel()], 1)  # one sample wider: for the gradients
+        x, y = self.grid.T
+        self.terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+        self.corners = torch.tensor([0, WIDTH + 1, -WIDTH - 2, -1], device=device)
+        self.samples = self.grid[(self.grid.abs() <= HALF).all(1)]
+        self.window = torch.exp(-(self.samples**2).sum(1) / (2 * HALF**2))
+        n = len(track)
+        self.shift = torch.zeros(n, 2, device=device)
+        self.linear = torch.eye(2, device=device).repeat(n, 1, 1)
+        self.values = torch.zeros(n, len(self.grid), device=device)
+        self.seen = torch.zeros(n, len(self.grid), device=device)
+        self.use = self.reference.float()  # of each view in the mean
+
+    def look(self, rows: Tensor) -> None:
+        """Sample the images of these rows where their patches lie now, brightness normalised."""
+        warp = self.warp[rows] @ self.moved_monomials(rows)
+        at = self.middle[rows, None] + self.terms @ warp.mT
+        values = self.torch.nn.functional.grid_sample(
+            self.images[rows], (2 * at[:, None] + 1) / SIDE - 1,
+            mode="bicubic", padding_mode="border", align_corners=False,
+        )[:, 0, 0]  # fmt: skip
+        low, high = self.edges[rows].unbind(1)
+        edge = at[:, self.corners]
+        part = ((edge < low[:, None]) | (edge > high[:, None])).any(-1).any(-1)
+        seen = self.torch.ones_like(values)
+        some = at[part]
+        seen[part] = ((some >= low[part, None]) & (some <= high[part, None])).all(-1).float()
+        mean, deviation = _moments(self.within(values), self.window * self.within(seen))
+        self.values[rows] = (values - mean) / deviation.clamp(min=LEAST_CONTRAST)
+        self.seen[rows] = seen
+
+    def moved_monomials(self, rows: Tensor) -> Tensor:
+        """Matrices (n, 6, 6): monomials of samples after the affine change, by those before."""
+        torch = self.torch
+        (sx, sy), (a, b, c, d) = self.shift[rows].T, self.linear[rows].reshape(-1, 4).T
+        nil, one = torch.zeros_like(sx), torch.ones_like(sx)
+        lines = [
+            [one, nil, nil, nil, nil, nil],
+            [sx, a, b, nil, nil, nil],
+            [sy, c, d, nil, nil, nil],
+            [sx * sx, 2 * sx * a, 2 * sx * b, a * a, 2 * a * b, b * b],
+            [sx * sy, sx * c + sy * a, sx * d + sy * b, a * c, a * d + b * c, b * d],
+            [sy * sy, 2 * sy * c, 2 * sy * d, c * c, 2 * c * d, d * d],
+        ]
+        return torch.stack([torch.stack(line, -1) for line in lines], 1)
+
+    def within(self, values: Tensor) -> Tensor:
+        """Of values (n, k) on the wider grid those of the patch itself."""
+        wide = values.view(len(values), WIDTH + 2, WIDTH + 2)
+        return wide[:, 1:-1, 1:-1].reshape(len(values), -1)
+
+    def mean(self) -> Tensor:
+        """Mean patch (n_tracks, n) of the views that count, on the wider grid."""
+        torch = self.torch
+        weight = self.seen * self.use[:, None]
+        zero = torch.zeros(self.n_tracks, len(self.grid), device=weight.device)
+        total = zero.index_add(0, self.track, weight)
+        return zero.index_add(0, self.track, weight * self.values) / total.clamp(min=1e-6)
+
+    def share(self) -> Tensor:
+        """How much of its track's mean each view is (n,)."""
+        count = self.torch.zeros(self.n_tracks, device=self.use.device)
+        count = count.index_add(0, self.track, self.use)
+        return (self.use / count[self.track].clamp(min=1)).clamp(max=0.9)
+
+    def design(self, mean: Tensor) -> Tensor:
+        """How the mean (n_tracks, n) changes by shift, affine change, brightness and contrast."""
+        from kornia.filters import spatial_gradient
+
+        side = WIDTH + 2
+        slopes = spatial_gradient(mean.view(-1, 1, side, side), mode="diff")[:, 0]
+        slopes = slopes[..., 1:-1, 1:-1].reshape(len(mean), 2, -1)
+        x, y = (self.samples / HALF).T
+        by_x, by_y = slopes[:, 0], slopes[:, 1]
+        inner = self.within(mean)
+        columns = [by_x, by_y, by_x * x, by_x * y, by_y * x, by_y * y]
+        return self.torch.stack([*columns, self.torch.ones_like(inner), inner], -1)
+
+    def normal(self, rows: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Normal equations (n, 8, 8), (n, 8) of rows, and their mean squared residuals (n,)."""
+        torch = self.torch
+        track = self.track[rows]
+        inner = self.within(mean)[track]
+        residual = self.within(self.values[rows]) - inner
+        weight = self.window * self.within(self.seen[rows])
+        square = (residual**2 * weight).sum(1) / weight.sum(1).clamp(min=1e-6)
+        weight = weight / (1 + residual**2 / (ODD**2 * square[:, None] + 1e-12))
+        J = self.design(mean)[track]
+        weighted = J * weight[..., None]
+        H = weighted.mT @ J
+        g = (weighted.mT @ residual[..., None])[..., 0]
+        used = (residual**2 * weight).sum(1) / weight.sum(1).clamp(min=1e-6)
+        held = used.clamp(min=1e-3) / (AFFINE_PRIOR * HALF) ** 2
+        affine = torch.arange(2, 6, device=H.device)
+        H[:, affine, affine] += held[:, None]
+        change = self.linear[rows] - torch.eye(2, device=H.device)
+        g[:, 2:6] += held[:, None] * HALF * change.reshape(-1, 4)
+        H.diagonal(dim1=1, dim2=2).add_(1e-6)
+        return H, g, used
+
+    def likeness(self, mean: Tensor) -> Tensor:
+        """Correlation (n,) of each view with the mean of the others of its track."""
+        share, inner = self.share()[:, None], self.within(self.values)
+        others = self.within(mean)[self.track] - share * inner
+        weight = self.window * self.within(self.seen)
+        centre, deviation = _moments(others, weight)
+        own, own_deviation = _moments(inner, weight)
+        product = ((others - centre) * (inner - own) * weight).sum(1, keepdim=True)
+        product /= weight.sum(1, keepdim=True).clamp(min=1e-6)
+        return (product / (deviation * own_deviation).clamp(min=1e-9))[:, 0]
+
+    def step(self, rows: Tensor, mean: Tensor, first: bool) -> Tensor:
+        """Move rows once; how far each moved, in samples."""
+        torch = self.torch
+        H, g, _ = self.normal(rows, mean)
+        step = torch.linalg.solve(H, g) / (1 - self.share()[rows])[:, None]
+        shift = step[:, :2].clamp(-MOST_SHIFT, MOST_SHIFT)
+        affine = (step[:, 2:6] / HALF).clamp(-MOST_AFFINE, MOST_AFFINE).view(-1, 2, 2)
+        affine = torch.where(self.reference[rows, None, None], 0.0, affine)
+        if first:  # the mean is the reference itself
+            shift = torch.where(self.reference[rows, None], 0.0, shift)
+        inverse = torch.linalg.inv(torch.eye(2, device=affine.device) + affine)
+        self.linear[rows] = self.linear[rows] @ inverse
+        self.shift[rows] -= (self.linear[rows] @ shift[..., None])[..., 0]
+        return torch.maximum(shift.abs().amax(1), HALF * affine.abs().amax((1, 2)))
+
+    def count_in(self, mean: Tensor) -> None:
+        """Let the views that are like the others form the mean; the reference where none are."""
+        like = (self.likeness(mean) > LEAST_LIKE).float()
+        count = self.torch.zeros(self.n_tracks, device=like.device)
+        count = count.index_add(0, self.track, like)
+        self.use = self.torch.where(count[self.track] < 2, self.reference.float(), like)
+
+
+def _moments(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean and standard deviation (n, 1) of values (n, k)."""
+    total = weight.sum(1, keepdim=True).clamp(min=1e-6)
+    mean = (values * weight).sum(1, keepdim=True) / total
+    return mean, ((values - mean) ** 2 * weight).sum(1, keepdim=True).div(total).sqrt()
+
+
+def align(
+    torch: Any, crops: Crops, track: IntArray, reference: BoolArray, device: str = "cpu"
+) -> Aligned:
+    """Align the patches of whole tracks; track (n,) of each, and whether it is the reference.
+
+    A view that shows nothing, or nothing like the others, comes out with little likeness.
+    """
+    with torch.inference_mode():  # a setting of each thread
+        batch = _Batch(torch, crops, track, reference, device)
+        moving = torch.arange(len(track), device=device)
+        for number in range(STEPS):
+            batch.look(moving)
+            mean = batch.mean()
+            if number:
+                batch.count_in(mean)
+                mean = batch.mean()
+            moved = batch.step(moving, mean, first=number == 0)
+            moving = moving[moved > AT_REST] if number > 1 else moving
+            if not len(moving):
+                break
+        return _aligned(batch, crops)
+
+
+def _aligned(batch: _Batch, crops: Crops) -> Aligned:
+    torch, every = batch.torch, batch.torch.arange(len(batch.track), device=batch.track.device)
+    mean = batch.mean()
+    H, _, square = batch.normal(every, mean)
+    x, y = batch.shift.double().unbind(1)
+    terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    one, nil = torch.ones_like(x), torch.zeros_like(x)
+    by_sample = torch.stack(
+        [
+            torch.stack([nil, one, nil, 2 * x, y, nil], -1),
+            torch.stack([nil, nil, one, nil, x, 2 * y], -1),
+        ],
+        -1,
+    )  # (n, 6, 2)
+    warp = batch.warp.double()
+    px = torch.from_numpy(crops.px.astype(np.float64)).to(warp.device)
+    pixels = (warp @ terms[..., None])[..., 0] * px[:, None]
+    by_shift = warp @ by_sample @ batch.linear.double() * px[:, None, None]
+    # A view is a part of the mean that it is judged by.
+    noise = square.double() / (1 - batch.share().double())
+    of_shift = torch.linalg.inv(H.double())[:, :2, :2] * noise[:, None, None]
+    cov = by_shift @ of_shift @ by_shift.mT
+    return Aligned(pixels.cpu().numpy(), cov.cpu().numpy(), batch.likeness(mean).cpu().numpy())

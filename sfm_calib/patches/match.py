@@ -1,0 +1,95 @@
+"""All patches of a problem matched, batch by batch, out of its images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphs.frames import FloatArray
+from graphs.problem import Estimate, IntArray, Observations
+from sfm_calib.images import Progress
+from sfm_calib.patches.alignment import Aligned, align
+from sfm_calib.patches.crops import Images, cut_out, has_place
+from sfm_calib.patches.warps import warps_of
+from sfm_calib.torch_import import import_torch
+
+FILE = "patches.npz"
+# Observations at once: their samples fit a core's cache, and 100 times as many a small GPU.
+A_BATCH = {"cpu": 3000, "cuda": 300_000}
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What is matched, and in which images."""
+
+    estimate: Estimate
+    seen: Observations
+    middle: FloatArray  # (n_obs, 2) px, where each patch starts
+    image: IntArray  # (n_obs,) number of each observation's image
+    paths: Sequence[Path]  # of the images, by number
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What matching found of each observation."""
+
+    pixels: FloatArray  # (n_obs, 2)
+    cov_px: FloatArray  # (n_obs, 2, 2)
+    likeness: FloatArray  # (n_obs,) to the other views of its track; 0 where nothing could be seen
+    linear: FloatArray  # (n_obs, 2, 2) px a sample, before matching
+
+
+def match_patches(sights: Sights, device: str, cores: int, place: Path, progress: Progress) -> None:
+    """Match all patches and keep what was found in a folder, as `load_matches` reads it.
+
+    Raises CalibrationError where an image or the device cannot be had.
+    """
+    torch = import_torch(device)
+    seen, n = sights.seen, len(sights.seen)
+    warps = warps_of(sights.estimate, seen, sights.middle)
+    unknown = np.full((n, 2, 2), np.inf)
+    found = Matches(sights.middle.copy(), unknown, np.zeros(n), warps.linear)
+    sizes = np.array([camera.size for camera in sights.estimate.cameras])[seen.camera]
+    shown = has_place(warps, sizes)
+    shown &= shown[warps.reference]  # without its square nothing is known of a track
+    images, done = Images(sights.paths), 0
+
+    def matched(rows: IntArray) -> tuple[IntArray, Aligned]:
+        part = warps.subset(rows)
+        crops = cut_out(images, sights.image[rows], part)
+        is_reference = part.reference == np.arange(len(rows))
+        return rows, align(torch, crops, seen.point[rows], is_reference, device)
+
+    batches = _batches(seen.point, sights.image, np.flatnonzero(shown), A_BATCH[device])
+    # One thread a batch: torch's own wait for each other after every sum, and spin.
+    torch.set_num_threads(1)
+    with ThreadPoolExecutor(cores) as pool:
+        for rows, aligned in pool.map(matched, batches):
+            found.pixels[rows] += aligned.pixels
+            found.cov_px[rows] = aligned.cov_px
+            found.likeness[rows] = aligned.likeness
+            progress("matching patches", done := done + len(rows), int(shown.sum()))
+    np.savez(place / FILE, **vars(found))
+
+
+def load_matches(place: Path) -> Matches:
+    """The matches that `match_patches` kept."""
+    with np.load(place / FILE) as file:
+        return Matches(*(file[name] for name in Matches.__dataclass_fields__))
+
+
+def _batches(point: IntArray, image: IntArray, rows: IntArray, size: int) -> Iterator[IntArray]:
+    """Rows in turn, ascending in each batch: whole tracks, those near each other in the scan."""
+    first = np.full(int(point.max(initial=0)) + 1, np.iinfo(np.int64).max)
+    np.minimum.at(first, point[rows], image[rows])
+    rows = rows[np.lexsort((point[rows], first[point[rows]]))]
+    begins = np.flatnonzero(np.diff(point[rows], prepend=-1))
+    batch = begins // size
+    starts = begins[np.flatnonzero(np.diff(batch, prepend=-1))]
+    for part in np.split(rows, starts[1:]):
+        if len(part):
+            yield np.sort(part)
