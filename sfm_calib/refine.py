@@ -35,7 +35,6 @@ from sfm_calib.worker import run_apart
 # sigma below that does no harm.
 LEAST_LIKENESS = 0.7
 MOST_SIGMA_PX = 0.3
-MOST_SAMPLES_MOVED = 3.0  # from the keypoint: farther lies another thing that looks alike
 FLOOR_PX = 0.01  # of the sigma: what interpolating and a surface's shape leave at the least
 LEAST_MATCHED = 0.2  # of the observations: of scans that went well nine in ten are
 MOST_ROUNDS = 3
@@ -173,7 +172,7 @@ def _matched(
     pixels, cov_px, linear = (one.copy() for one in (state.pixels, state.cov_px, state.linear))
     good = state.good.copy()
     pixels[rows], cov_px[rows], linear[rows] = found.pixels, found.cov_px, found.linear
-    good[rows] = _is_good(found, seen)
+    good[rows] = is_good(found)
     if good.mean() < LEAST_MATCHED:
         raise CalibrationError(
             f"only {good.sum():,} of {len(good):,} observations look alike in the images of their "
@@ -182,17 +181,11 @@ def _matched(
     return _State(now, pixels, cov_px, linear, good)
 
 
-def _is_good(found: Matches, seen: Observations) -> BoolArray:
-    step_px = np.sqrt(np.abs(np.linalg.det(found.linear)))
-    moved_px = np.linalg.norm(found.pixels - seen.pixels, axis=1)
+def is_good(found: Matches) -> BoolArray:
+    """Which observations (n_obs,) look like the rest of their track, at a place that is known."""
     with np.errstate(invalid="ignore"):
         sigma_px = np.abs(np.linalg.det(found.cov_px)) ** 0.25
-        good: BoolArray = (
-            (found.likeness >= LEAST_LIKENESS)
-            & (sigma_px <= MOST_SIGMA_PX)
-            & (moved_px <= MOST_SAMPLES_MOVED * step_px)
-        )
-    return good
+    return (found.likeness >= LEAST_LIKENESS) & (sigma_px <= MOST_SIGMA_PX)
 
 
 def _solved(state: _State, graph_options: GraphOptions, options: Options) -> _State:

@@ -31,11 +31,19 @@ STEPS = 8  # four or five bring nine in ten to rest
 AT_REST = 0.008  # samples: a fifth of what noise leaves, and the next step is far smaller
 MOST_SHIFT, MOST_AFFINE = 1.0, 0.15  # a step, in samples and per sample
 LEAST_LIKE = 0.6  # correlation of a view that counts in the mean
+# From where it began, in samples: what lies farther away and looks alike is another thing.
+MOST_WANDERED = 3.0
 # Residuals this many times the rms of their view count half: few of its samples may differ.
 ODD = 6.0**0.5
 AFFINE_PRIOR = 0.25  # sigma: surfaces slope, but what shears a patch into a line is an edge's slide
 LEAST_CONTRAST = 0.5  # grey levels: sensor noise alone has more
 WIDTH = 2 * HALF + 1
+# A cubic spline through pixels, halfway between two: what the four pixels on either side add
+# (Unser, Aldroubi and Eden, IEEE Transactions on Signal Processing 41, 1993).
+POLE = 3**0.5 - 2
+SPLINE = 3**0.5 * POLE ** np.abs(np.arange(-5, 7))
+HALFWAY = np.convolve(SPLINE, [1 / 48, 23 / 48, 23 / 48, 1 / 48])[3:11]
+HALFWAY /= HALFWAY.sum()
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,9 @@ class _Batch:
             return torch.from_numpy(np.ascontiguousarray(values)).to(device, torch.float32)
 
         self.torch = torch
-        self.images = tensor(crops.pixels)[:, None]
+        doubling = tensor(_doubling())
+        # Of those rows that `look` is asked for next.
+        self.images = (doubling @ tensor(crops.pixels) @ doubling.T)[:, None]
         self.edges = tensor(crops.inside)
         self.middle, self.warp = tensor(crops.middle), tensor(crops.coefficients)
         self.track = torch.from_numpy(np.unique(track, return_inverse=True)[1]).to(device)
@@ -76,14 +86,15 @@ class _Batch:
         self.linear = torch.eye(2, device=device).repeat(n, 1, 1)
         self.values = torch.zeros(n, len(self.grid), device=device)
         self.seen = torch.zeros(n, len(self.grid), device=device)
-        self.use = self.reference.float()  # of each view in the mean
+        self.use = torch.ones(n, device=device)  # of each view in the mean
+        self.seed = self.reference
 
     def look(self, rows: Tensor) -> None:
         """Sample the images of these rows where their patches lie now, brightness normalised."""
         warp = self.warp[rows] @ self.moved_monomials(rows)
         at = self.middle[rows, None] + self.terms @ warp.mT
         values = self.torch.nn.functional.grid_sample(
-            self.images[rows], (2 * at[:, None] + 1) / SIDE - 1,
+            self.images, (4 * at[:, None] + 1) / (2 * SIDE - 1) - 1,
             mode="bicubic", padding_mode="border", align_corners=False,
         )[:, 0, 0]  # fmt: skip
         low, high = self.edges[rows].unbind(1)
@@ -124,11 +135,18 @@ class _Batch:
         total = zero.index_add(0, self.track, weight)
         return zero.index_add(0, self.track, weight * self.values) / total.clamp(min=1e-6)
 
+    def others(self) -> Tensor:
+        """How many other views of its track count in the mean, for each (n,)."""
+        return self.of_track(self.use)[self.track] - self.use
+
+    def of_track(self, values: Tensor) -> Tensor:
+        """Sums (n_tracks,) of values (n,)."""
+        zero = self.torch.zeros(self.n_tracks, device=values.device)
+        return zero.index_add(0, self.track, values)
+
     def share(self) -> Tensor:
         """How much of its track's mean each view is (n,)."""
-        count = self.torch.zeros(self.n_tracks, device=self.use.device)
-        count = count.index_add(0, self.track, self.use)
-        return (self.use / count[self.track].clamp(min=1)).clamp(max=0.9)
+        return self.use / (self.others() + self.use).clamp(min=1)
 
     def design(self, mean: Tensor) -> Tensor:
         """How the mean (n_tracks, n) changes by shift, affine change, brightness and contrast."""
@@ -166,7 +184,10 @@ class _Batch:
         return H, g, used
 
     def likeness(self, mean: Tensor) -> Tensor:
-        """Correlation (n,) of each view with the mean of the others of its track."""
+        """Correlation (n,) of each view with the mean of the others of its track.
+
+        0 where there are none, and where it wandered off.
+        """
         share, inner = self.share()[:, None], self.within(self.values)
         others = self.within(mean)[self.track] - share * inner
         weight = self.window * self.within(self.seen)
@@ -174,29 +195,60 @@ class _Batch:
         own, own_deviation = _moments(inner, weight)
         product = ((others - centre) * (inner - own) * weight).sum(1, keepdim=True)
         product /= weight.sum(1, keepdim=True).clamp(min=1e-6)
-        return (product / (deviation * own_deviation).clamp(min=1e-9))[:, 0]
+        like = (product / (deviation * own_deviation).clamp(min=1e-9))[:, 0]
+        near = self.shift.norm(dim=1) <= MOST_WANDERED
+        return self.torch.where(near & (self.others() > 0), like, 0.0)
 
     def step(self, rows: Tensor, mean: Tensor, first: bool) -> Tensor:
         """Move rows once; how far each moved, in samples."""
         torch = self.torch
         H, g, _ = self.normal(rows, mean)
-        step = torch.linalg.solve(H, g) / (1 - self.share()[rows])[:, None]
+        # A view is a part of the mean that it is drawn to.
+        step = torch.linalg.solve(H, g) / (1 - self.share()[rows]).clamp(min=0.1)[:, None]
         shift = step[:, :2].clamp(-MOST_SHIFT, MOST_SHIFT)
         affine = (step[:, 2:6] / HALF).clamp(-MOST_AFFINE, MOST_AFFINE).view(-1, 2, 2)
         affine = torch.where(self.reference[rows, None, None], 0.0, affine)
-        if first:  # the mean is the reference itself
-            shift = torch.where(self.reference[rows, None], 0.0, shift)
+        if first:  # the mean is the seed itself
+            shift = torch.where(self.seed[rows, None], 0.0, shift)
         inverse = torch.linalg.inv(torch.eye(2, device=affine.device) + affine)
         self.linear[rows] = self.linear[rows] @ inverse
         self.shift[rows] -= (self.linear[rows] @ shift[..., None])[..., 0]
         return torch.maximum(shift.abs().amax(1), HALF * affine.abs().amax((1, 2)))
 
+    def begin(self) -> None:
+        """Let the view that is most like the mean of all be the first mean: none that is hidden."""
+        torch = self.torch
+        like = self.likeness(self.mean())
+        best = torch.full((self.n_tracks,), -2.0, device=like.device)
+        best = best.scatter_reduce(0, self.track, like, "amax")
+        row = torch.arange(len(like), device=like.device)
+        none = len(like)
+        first = torch.full((self.n_tracks,), none, device=like.device)
+        candidates = torch.where(like == best[self.track], row, none)
+        first = first.scatter_reduce(0, self.track, candidates, "amin")
+        self.seed = row == first[self.track]
+        self.use = self.seed.float()
+
     def count_in(self, mean: Tensor) -> None:
-        """Let the views that are like the others form the mean; the reference where none are."""
+        """Let the views that are like the others form the mean; the seed where none are."""
         like = (self.likeness(mean) > LEAST_LIKE).float()
-        count = self.torch.zeros(self.n_tracks, device=like.device)
-        count = count.index_add(0, self.track, like)
-        self.use = self.torch.where(count[self.track] < 2, self.reference.float(), like)
+        few = self.of_track(like)[self.track] < 2
+        self.use = self.torch.where(few, self.seed.float(), like)
+
+
+def _doubling() -> FloatArray:
+    """Matrix (2 * SIDE - 1, SIDE) from a row of pixels to one with as many between them.
+
+    By cubic splines. torch's bicubic sampling alone (Keys' kernel with a = -0.75) errs by 0.015 px,
+    more or less by where between the pixels a sample lies; of the doubled image by half of that.
+    """
+    reach = len(HALFWAY) // 2
+    result = np.zeros((2 * SIDE - 1, SIDE))
+    result[::2] = np.eye(SIDE)
+    for row in range(SIDE - 1):
+        for k, share in enumerate(HALFWAY, row - reach + 1):
+            result[2 * row + 1, min(max(k, 0), SIDE - 1)] += share
+    return result
 
 
 def _moments(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -218,14 +270,17 @@ def align(
         moving = torch.arange(len(track), device=device)
         for number in range(STEPS):
             batch.look(moving)
-            mean = batch.mean()
             if number:
-                batch.count_in(mean)
-                mean = batch.mean()
+                batch.count_in(batch.mean())
+            else:
+                batch.begin()
+            mean = batch.mean()
             moved = batch.step(moving, mean, first=number == 0)
-            moving = moving[moved > AT_REST] if number > 1 else moving
-            if not len(moving):
-                break
+            if number > 1:
+                going_on = moved > AT_REST
+                moving, batch.images = moving[going_on], batch.images[going_on]
+                if not len(moving):
+                    break
         return _aligned(batch, crops)
 
 
@@ -247,8 +302,7 @@ def _aligned(batch: _Batch, crops: Crops) -> Aligned:
     px = torch.from_numpy(crops.px.astype(np.float64)).to(warp.device)
     pixels = (warp @ terms[..., None])[..., 0] * px[:, None]
     by_shift = warp @ by_sample @ batch.linear.double() * px[:, None, None]
-    # A view is a part of the mean that it is judged by.
-    noise = square.double() / (1 - batch.share().double())
+    noise = square.double() / (1 - batch.share().double()).clamp(min=0.1)
     of_shift = torch.linalg.inv(H.double())[:, :2, :2] * noise[:, None, None]
     cov = by_shift @ of_shift @ by_shift.mT
     return Aligned(pixels.cpu().numpy(), cov.cpu().numpy(), batch.likeness(mean).cpu().numpy())

@@ -34,7 +34,7 @@ class Images:
     paths: Sequence[Path]
     most_bytes: int = MOST_BYTES
     _kept: OrderedDict[int, list[NDArray[np.uint8]]] = field(default_factory=OrderedDict)
-    _bytes: int = 0
+    bytes_kept: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def pyramid(self, number: int) -> list[NDArray[np.uint8]]:
@@ -56,10 +56,10 @@ class Images:
         while len(levels) <= LEVELS and min(levels[-1].shape) > 2:
             levels.append(cv2.pyrDown(levels[-1]))
         self._kept[number] = levels
-        self._bytes += sum(level.nbytes for level in levels)
-        while self._bytes > self.most_bytes and len(self._kept) > 1:
+        self.bytes_kept += sum(level.nbytes for level in levels)
+        while self.bytes_kept > self.most_bytes and len(self._kept) > 1:
             _, gone = self._kept.popitem(last=False)
-            self._bytes -= sum(level.nbytes for level in gone)
+            self.bytes_kept -= sum(level.nbytes for level in gone)
         return levels
 
 

@@ -1,0 +1,227 @@
+"""Least-squares matching, on pictures of walls where every pixel is known to rounding."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from synthetic.scans import silent
+from synthetic.walls import CAMERA, DISTANCES, NORMALS, Scene, Walls, scene
+
+from graphs.camera import project
+from graphs.frames import FloatArray
+from graphs.noise import RAYLEIGH_MEDIAN
+from sfm_calib.errors import CalibrationError
+from sfm_calib.patches import match
+from sfm_calib.patches.crops import Images, cut_out
+from sfm_calib.patches.match import Matches, Sights, load_matches, match_patches
+from sfm_calib.patches.warps import HALF, monomials, steps_px, warps_of
+from sfm_calib.refine import is_good
+
+pytest.importorskip("torch", reason="torch is an extra: pip install 'sfm_calib[learned]'")
+pytest.importorskip("kornia", reason="kornia is an extra: pip install 'sfm_calib[learned]'")
+
+
+@cache
+def drawn(noise: float = 1.0, keypoint_px: float = 0.4, scale: float = 1.5) -> Scene:
+    return scene(noise=noise, keypoint_px=keypoint_px, scale=scale)
+
+
+def matched(one: Scene, folder: Path, images: list[np.ndarray] | None = None) -> Matches:
+    paths = []
+    for index, image in enumerate(images or one.images):
+        paths.append(folder / f"{index}.png")
+        cv2.imwrite(str(paths[-1]), image)
+    seen = one.problem.observations
+    sights = Sights(one.true.initial, seen, seen.pixels, seen.frame, paths)
+    match_patches(sights, "cpu", 2, folder, silent)
+    return load_matches(folder)
+
+
+def errors(one: Scene, found: Matches) -> FloatArray:
+    """Pixels (n_obs, 2) from where each view shows what its track's views show together.
+
+    A track may lie anywhere on its wall: the place is the one that suits its pixels best.
+    """
+    start, seen = one.true.initial, one.true.observations
+    result = np.empty((len(seen), 2))
+    for point in np.unique(seen.point):
+        rows = np.flatnonzero(seen.point == point)
+        views = [start.rig_from_world[frame] for frame in seen.frame[rows]]
+        place = start.points[point]
+        wall = NORMALS[np.argmin(np.abs(NORMALS @ place - DISTANCES))]
+        along = np.linalg.svd(wall[None])[2][1:]
+
+        def shown(at: FloatArray, views=views) -> FloatArray:
+            return np.array([project(CAMERA, view @ at) for view in views])
+
+        for _ in range(3):
+            off = found.pixels[rows] - shown(place)
+            slope = [(shown(place + 1e-6 * d) - shown(place)).ravel() / 1e-6 for d in along]
+            place = place + np.linalg.lstsq(np.array(slope).T, off.ravel(), rcond=None)[0] @ along
+        result[rows] = found.pixels[rows] - shown(place)
+    return result
+
+
+def left(one: Scene) -> FloatArray:
+    """How much of an error (n_obs,) is left, of variance, once what a track shares is taken."""
+    return 1 - 1 / np.bincount(one.true.observations.point)[one.true.observations.point]
+
+
+def typical(values: FloatArray) -> float:
+    """Sigma of a coordinate of errors (n, 2) by their median: corners of the room bend some."""
+    return float(np.median(np.linalg.norm(values, axis=1)) / RAYLEIGH_MEDIAN)
+
+
+# ---- warps ----------------------------------------------------------------------------------
+
+
+def test_a_warp_shows_the_plane_across_the_view_through_every_lens() -> None:
+    one = drawn()
+    start, seen = one.true.initial, one.true.observations
+    warps = warps_of(start, seen, seen.pixels)
+    centres = np.array([t.inverse.translation for t in start.rig_from_world])
+    step = steps_px(seen)[0]
+    samples = np.array([(0.0, 0.0), (HALF, -HALF), (-HALF, 2.0), (3.0, HALF)])
+    checked = 0
+    for row in range(0, len(seen), 7):
+        own = np.flatnonzero(seen.point == seen.point[row])
+        point = start.points[seen.point[row]]
+        towards = centres[seen.frame[own]] - point
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        normal = towards.mean(0)
+        # the reference looks most along the normal
+        reference = own[np.argmax(towards @ normal)]
+        assert warps.reference[row] == reference
+        here = start.rig_from_world[seen.frame[reference]]
+        # points of the plane that project to the reference's square, by Newton's steps
+        across = np.linalg.svd(normal[None])[2][1:]
+        at = np.zeros((len(samples), 2))
+        wanted = seen.pixels[reference] + step * samples
+        for _ in range(20):
+            now = project(CAMERA, here @ (point + at @ across))
+            slope = np.stack(
+                [(project(CAMERA, here @ (point + (at + d) @ across)) - now) / 1e-6
+                 for d in 1e-6 * np.eye(2)], -1)  # fmt: skip
+            at += np.linalg.solve(slope, (wanted - now)[..., None])[..., 0]
+        there = project(CAMERA, start.rig_from_world[seen.frame[row]] @ (point + at @ across))
+        ours = warps.middle[row] + monomials(*samples.T) @ warps.coefficients[row].T
+        np.testing.assert_allclose(ours, there, atol=0.01)
+        checked += 1
+    assert checked > 50
+
+
+# ---- matching -------------------------------------------------------------------------------
+
+
+def test_patches_come_to_lie_where_the_walls_are(tmp_path: Path) -> None:
+    """Without noise; the keypoints start half a pixel off, and pixels are read between pixels."""
+    one = drawn(noise=0.0)
+    found = matched(one, tmp_path)
+    assert typical(errors(one, found)) < 0.01  # of a start of 0.4 px
+    assert is_good(found).mean() > 0.98 and (found.likeness > 0.98).mean() > 0.95
+
+
+def test_the_stated_covariance_is_that_of_the_errors(tmp_path: Path) -> None:
+    """Squared errors over the covariance, one a degree of freedom, and by direction too."""
+    one = drawn(noise=4.0)
+    found = matched(one, tmp_path)
+    off = errors(one, found) / np.sqrt(left(one))[:, None]
+    size, directions = np.linalg.eigh(found.cov_px)
+    along = np.einsum("nij,ni->nj", directions, off)
+    squared = along**2 / size
+    nees = np.median(squared, axis=0) / 0.455  # of the median of a squared normal
+    assert (nees > 0.75).all() and (nees < 1.4).all()
+    assert 0.03 < typical(off) < 0.06
+
+
+def test_brightness_does_not_matter(tmp_path: Path) -> None:
+    one = drawn(noise=0.0)
+    changed = [
+        np.clip(gain * image + bias, 0, 255).astype(np.uint8)
+        for image, gain, bias in zip(
+            one.images, (0.5, 0.8, 1.0, 0.6, 0.9, 0.7), (30, 0, 5, 60, 20, 10), strict=True
+        )
+    ]
+    found = matched(one, tmp_path, changed)
+    assert typical(errors(one, found)) < 0.012
+
+
+def test_stripes_are_uncertain_along_themselves(tmp_path: Path) -> None:
+    """Waves that all but run one way: across them a patch is sharp, along them it is not."""
+    walls = Walls.drawn()
+    flat = walls.waves * np.array([1.0, 0.15, 0.15])
+    one = scene(walls=replace(walls, waves=flat), noise=2.0, n_points=60)
+    found = matched(one, tmp_path)
+    on_back = np.linalg.norm(found.linear - np.eye(2), axis=(1, 2)) < 0.6
+    size, directions = np.linalg.eigh(found.cov_px[on_back])
+    assert np.median(size[:, 1] / size[:, 0]) > 9
+    off = errors(one, found)[on_back]
+    along = np.einsum("nij,ni->nj", directions, off)
+    assert np.median(np.abs(along[:, 1])) > 2 * np.median(np.abs(along[:, 0]))
+
+
+def test_what_stands_before_a_wall_is_seen_not_to_belong(tmp_path: Path) -> None:
+    """One image shows something else on its left; the others agree as before."""
+    one = drawn()
+    hidden = [image.copy() for image in one.images]
+    leaves = cv2.GaussianBlur(np.random.default_rng(9).normal(128, 300, (240, 160)), (0, 0), 2.0)
+    hidden[2][:, :160] = np.clip(leaves, 0, 255)
+    clean, found = matched(one, tmp_path), matched(one, tmp_path, hidden)
+    seen = one.true.observations
+    covered = (seen.frame == 2) & (seen.pixels[:, 0] < 145)
+    assert covered.sum() > 20
+    assert is_good(found)[covered].mean() < 0.1
+    others = np.isin(seen.point, seen.point[covered]) & (seen.frame != 2)
+    assert is_good(found)[others].mean() > 0.95
+    moved = np.linalg.norm(found.pixels - clean.pixels, axis=1)[others]
+    assert np.median(moved) < 0.1  # the mean of the others lies a little elsewhere on the wall
+
+
+def test_coarse_keypoints_are_matched_in_smaller_images(tmp_path: Path) -> None:
+    one = drawn(scale=6.0, keypoint_px=1.0)
+    warps = warps_of(one.true.initial, one.true.observations, one.true.observations.pixels)
+    paths = [tmp_path / "0.png"]
+    cv2.imwrite(str(paths[0]), one.images[0])
+    crops = cut_out(Images(paths), np.zeros(3, np.int64), warps.subset(np.arange(3)))
+    assert (crops.px == 4).all()
+    found = matched(one, tmp_path)
+    shown = found.likeness > 0.8
+    assert shown.mean() > 0.7  # the walls' corners bend the rest
+    assert np.median(np.abs(errors(one, found)[shown])) < 0.1
+
+
+def test_a_patch_over_the_border_is_matched_by_what_is_there(tmp_path: Path) -> None:
+    one = scene(n_points=150, seed=3)
+    beyond = np.array(CAMERA.size) - 1 - one.true.observations.pixels
+    at_border = (np.minimum(one.true.observations.pixels, beyond) < 7).any(1)
+    found = matched(one, tmp_path)
+    assert at_border.sum() > 5
+    assert np.median(np.abs(errors(one, found)[at_border])) < 0.06
+
+
+def test_batches_and_threads_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = drawn()
+    whole, again = matched(one, tmp_path), matched(one, tmp_path)
+    np.testing.assert_array_equal(whole.pixels, again.pixels)
+    monkeypatch.setitem(match.A_BATCH, "cpu", 100)
+    parts = matched(one, tmp_path)
+    np.testing.assert_allclose(whole.pixels, parts.pixels, atol=2e-3)
+    np.testing.assert_allclose(whole.likeness, parts.likeness, atol=1e-3)
+
+
+def test_images_beyond_the_memory_are_read_again(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{i}.png" for i in range(4)]
+    for index, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((64, 64), 40 * index, np.uint8))
+    images = Images(paths, most_bytes=12_000)  # two pyramids of 64 x 64
+    for number in (0, 1, 2, 3, 0, 3, 1):
+        assert images.pyramid(number)[0][5, 5] == 40 * number
+        assert images.bytes_kept <= 12_000
+    paths[2].write_bytes(b"")
+    with pytest.raises(CalibrationError, match=r"2\.png can no longer be read"):
+        images.pyramid(2)
