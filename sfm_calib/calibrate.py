@@ -39,6 +39,7 @@ from sfm_calib.refine import refine_tracks
 from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
+from sfm_calib.torch_import import check_torch
 
 FEW_PLACED = 0.5  # of the images: of scans that went well, nine in ten and more are
 FRAMES_TO_JUDGE = 6  # fewer, placed together, do not show how a rig moved through its scan
@@ -86,6 +87,8 @@ def checked_scan(
     scan_path: Path, config: RigConfig, cache: Cache, progress: Progress, watch: Stopwatch
 ) -> Scan:
     """The images of a scan, which the configuration fits."""
+    if config.refine:
+        check_torch("--refine")  # before minutes of mapping
     with watch.stage("reading images"):
         scan = read_scan(scan_path, cache, config.frames, config.video_frames, progress)
         check_config(config, scan)
@@ -104,23 +107,21 @@ def mapped_scan(
     lenses = [lens_of(config, name, len(scan.cameras)) for name in scan.cameras]
     with watch.stage("tracks and mapping"):
         mapped = map_scan(scan, config, lenses, known_cameras(config, scan), cache, progress)
-    mapped = remeasured(mapped, scan, config, cache, progress, watch)
+    if config.refine:
+        with watch.stage("matching patches"):
+            mapped = remeasured(mapped, scan, config, cache, progress)
     given = Given(scan, config, mapped, command)
     return given, start_from_config(mapped.problem, config)
 
 
 def remeasured(
-    mapped: Mapped,
-    scan: Scan,
-    config: RigConfig,
-    cache: Cache,
-    progress: Progress,
-    watch: Stopwatch,
+    mapped: Mapped, scan: Scan, config: RigConfig, cache: Cache, progress: Progress
 ) -> Mapped:
-    """What was mapped with its tracks measured anew, where the configuration asks for it."""
-    if not config.refine:
-        return mapped
-    with watch.stage("matching patches"), refusals(mapped.problem):
+    """What was mapped, its tracks measured anew in the scan's images.
+
+    Raises CalibrationError as `refine_tracks`, and where the problem determines too little.
+    """
+    with refusals(mapped.problem):
         options = options_of(mapped.problem, config)
         refined = refine_tracks(mapped.problem, scan, options, config, cache, progress)
     messages = (*mapped.messages, refined.message)

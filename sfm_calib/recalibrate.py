@@ -36,6 +36,7 @@ from sfm_calib.calibrate import (
     enough_placed,
     own_covariance_of,
     refusals,
+    remeasured,
     solve_problem,
 )
 from sfm_calib.config import BaselineConfig, RigConfig
@@ -125,7 +126,8 @@ def recalibrate(
     scan = checked_scan(scan_path, config, cache, progress, watch)
 
     def mapping(old: CameraRig, config: RigConfig) -> Mapped:
-        return map_with_prior(scan, old, config, cache, progress)
+        mapped = map_with_prior(scan, old, config, cache, progress)
+        return remeasured(mapped, scan, config, cache, progress) if config.refine else mapped
 
     return recalibrate_scan(
         read, scan, mapping, config, options, drift, progress, command, watch

@@ -15,7 +15,7 @@ from sfm_calib.images import Progress
 from sfm_calib.patches.alignment import Aligned, align
 from sfm_calib.patches.crops import Images, cut_out, has_place
 from sfm_calib.patches.warps import warps_of
-from sfm_calib.torch_import import import_torch
+from sfm_calib.torch_import import Device, import_torch
 
 FILE = "patches.npz"
 # Observations at once: their samples fit a core's cache, and 100 times as many a small GPU.
@@ -43,12 +43,14 @@ class Matches:
     linear: FloatArray  # (n_obs, 2, 2) px a sample, before matching
 
 
-def match_patches(sights: Sights, device: str, cores: int, place: Path, progress: Progress) -> None:
+def match_patches(
+    sights: Sights, device: Device, n_threads: int, place: Path, progress: Progress
+) -> None:
     """Match all patches and keep what was found in a folder, as `load_matches` reads it.
 
     Raises CalibrationError where an image or the device cannot be had.
     """
-    torch = import_torch(device)
+    torch = import_torch("--refine", device)
     seen, n = sights.seen, len(sights.seen)
     warps = warps_of(sights.estimate, seen, sights.middle)
     unknown = np.full((n, 2, 2), np.inf)
@@ -67,7 +69,7 @@ def match_patches(sights: Sights, device: str, cores: int, place: Path, progress
     batches = _batches(seen.point, sights.image, np.flatnonzero(shown), A_BATCH[device])
     # One thread a batch: torch's own wait for each other after every sum, and spin.
     torch.set_num_threads(1)
-    with ThreadPoolExecutor(cores) as pool:
+    with ThreadPoolExecutor(n_threads) as pool:
         for rows, aligned in pool.map(matched, batches):
             found.pixels[rows] += aligned.pixels
             found.cov_px[rows] = aligned.cov_px
