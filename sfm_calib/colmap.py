@@ -35,6 +35,7 @@ PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
 PAIRS_A_BATCH = 200
 GLOBAL_ADJUSTMENT_GROWTH = 1.3  # of the model between two global adjustments
+LONGEST_SIDE = 3200  # px, COLMAP's own limit: features of larger images are found in reduced ones
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
 
 # COLMAP's names of its parameters, where they are not ours.
@@ -94,9 +95,10 @@ def extract_features(
     known: dict[int, Camera],
     database: Path,
     max_features: int,
+    image_scale: float,
     progress: Progress,
 ) -> None:
-    """SIFT features of every image; one COLMAP camera a physical camera.
+    """SIFT features of every image, found at this share of its size; a COLMAP camera a camera.
 
     `known`: cameras whose parameters are given; the others start from EXIF or a guess.
     """
@@ -107,6 +109,8 @@ def extract_features(
         pass  # importing images wants it to exist
     done = 0
     for index in range(len(scan.cameras)):
+        longest = min(max(scan.sizes[index]), LONGEST_SIDE)
+        options.max_image_size = round(image_scale * longest)
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = MAPPING_MODEL[lenses[index]]
         reader.default_focal_length_factor = DEFAULT_FOCAL

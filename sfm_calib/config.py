@@ -74,6 +74,9 @@ class Options(SolveOptions):
     """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
     """SIFT features an image, at most: 100 to 50000."""
+    image_scale: Annotated[float, Field(ge=0.1, le=1)] = 1.0
+    """Find features in images reduced to this share of their size: 0.1 to 1. It is faster, and with
+    --refine, which measures in full size, no less sharp."""
     refine: bool = False
     """Measure every track anew, by matching its patches: to hundredths of a pixel (needs torch)."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -49,34 +49,41 @@ class Features:
         return first[inverse.ravel()].astype(np.int64)
 
 
-def extract(scan: Scan, max_features: int, place: Path, progress: Progress) -> None:
+def extract(
+    scan: Scan, max_features: int, image_scale: float, place: Path, progress: Progress
+) -> None:
     """Find the features of every image and keep them in `place`."""
     cv2.setNumThreads(1)  # images are shared out, not rows
     found = []
     with threads() as pool:
         paths = [scan.root / image.path for image in scan.images]
-        for one in pool.map(lambda path: features_of(path, max_features), paths):
+        for one in pool.map(lambda path: features_of(path, max_features, image_scale), paths):
             found.append(one)
             progress("extracting features", len(found), len(paths))
     save(found, place)
 
 
-def features_of(path: Path, max_features: int) -> Features:
-    """The largest features of one image file.
+def features_of(path: Path, max_features: int, image_scale: float = 1.0) -> Features:
+    """The largest features of one image file, found at this share of its size.
 
     Raises CalibrationError where it cannot be read.
     """
     image = cv2.imread(os.fspath(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise CalibrationError(f"{path.name} cannot be read: convert it to PNG or JPEG")
+    height, width = image.shape
+    if image_scale < 1:
+        reduced = round(image_scale * width), round(image_scale * height)
+        image = cv2.resize(image, reduced, interpolation=cv2.INTER_AREA)
     # Without the precise upscale every feature is a quarter of a pixel off.
     sift = cv2.SIFT_create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(image, None)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
-    sizes = np.array([keypoint.size for keypoint in keypoints], dtype=np.float64)
+    enlarged = np.array([width, height]) / (image.shape[1], image.shape[0])
+    sizes = enlarged.mean() * np.array([keypoint.size for keypoint in keypoints])
     largest = np.argsort(-sizes, kind="stable")[: _whole_levels(sizes, max_features)]
-    pixels = cv2.KeyPoint.convert(keypoints).astype(np.float64)
+    pixels = enlarged * (cv2.KeyPoint.convert(keypoints).astype(np.float64) + 0.5) - 0.5
     return Features(pixels[largest], sizes[largest] / 2, _rooted(descriptors[largest]))
 
 

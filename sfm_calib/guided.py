@@ -65,11 +65,12 @@ def map_with_prior(
         for i, name in enumerate(scan.cameras)
     ]
     hashes = scan.hashes
-    inputs: list[object] = [hashes, scan.cameras, config.max_features, cv2.__version__]
+    sought = config.max_features, config.image_scale
+    inputs: list[object] = [hashes, scan.cameras, *sought, cv2.__version__]
     place = cache.stage(
         "guided_features",
         inputs,
-        lambda place: run_apart(features.extract, (scan, config.max_features, place), progress),
+        lambda place: run_apart(features.extract, (scan, *sought, place), progress),
     )
     nominal = _nominal(scan, old, reference_of(scan, config))
     inputs += [scan.frames, config.pairs, config.seed, lenses, colmap.VERSION]

@@ -51,7 +51,7 @@ def map_scan(
     """
     hashes = scan.hashes
     inputs: list[object] = [
-        hashes, scan.cameras, lenses, config.max_features,
+        hashes, scan.cameras, lenses, config.max_features, config.image_scale,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
     ]  # fmt: skip
     features = cache.stage(
@@ -116,7 +116,9 @@ def _extract(
     progress: Progress,
 ) -> None:
     database = place / DATABASE
-    colmap.extract_features(scan, lenses, known, database, config.max_features, progress)
+    colmap.extract_features(
+        scan, lenses, known, database, config.max_features, config.image_scale, progress
+    )
 
 
 def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress: Progress) -> None:

@@ -3,6 +3,7 @@
 import sqlite3
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -27,7 +28,7 @@ def mapped(scan, place):
     """Database content and the largest model of a scan, made from nothing."""
     place.mkdir()
     database = place / "database.db"
-    colmap.extract_features(scan, ["radtan"] * 2, {}, database, 250, quiet)
+    colmap.extract_features(scan, ["radtan"] * 2, {}, database, 250, 1.0, quiet)
     n = len(scan.images)
     pairs = [(a, b) for a in range(n) for b in range(a + 1, n)]
     colmap.match_features(scan, pairs, database, 0, quiet)
@@ -51,6 +52,25 @@ def test_tracks_and_models_are_the_same_every_time(tmp_path):
     np.testing.assert_array_equal(model.observations.pixels, model_again.observations.pixels)
     for ours, others in zip(model.cameras, model_again.cameras, strict=True):
         np.testing.assert_array_equal(ours.params, others.params)
+
+
+@pytest.mark.parametrize("image_scale", [1.0, 0.5])
+def test_features_of_reduced_images_are_where_those_of_whole_ones_are(image_scale, tmp_path):
+    y, x = np.mgrid[:240, :320]
+    known = np.array([(40 + 48 * i + 0.37 * j, 40 + 40 * j) for i in range(6) for j in range(5)])
+    blobs = sum(150 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 50) for u, v in known)
+    cv2.imwrite(str(tmp_path / "0.png"), (50 + blobs).astype(np.uint8))
+    scan = Scan(tmp_path, ("a",), ((320, 240),), ("0",), (ScanImage(0, 0, "0.png"),))
+    database = tmp_path / "database.db"
+    colmap.extract_features(scan, ["radial"], {}, database, 1000, image_scale, quiet)
+    with pycolmap.Database.open(database) as db:
+        keypoints = np.asarray(db.read_keypoints(1))
+    apart = np.linalg.norm(keypoints[:, None, :2] - colmap.PIXEL_OFFSET - known, axis=-1)
+    off = (keypoints[apart.argmin(0), :2] - colmap.PIXEL_OFFSET - known)[apart.min(0) < 1]
+    assert len(off) > 25
+    assert np.abs(off.mean(0)).max() < 0.06  # a convention missed is a quarter or half a pixel
+    size = colmap.keypoint_scales(database)["0.png"][apart.argmin(0)]
+    assert np.median(size) == pytest.approx(5, rel=0.25)
 
 
 @pytest.mark.parametrize("reference", [0, 1])

@@ -25,14 +25,15 @@ def blobs(tmp_path_factory):
     return path, np.array(known)
 
 
-def test_pixel_centres_are_at_integers_and_scales_are_the_blobs(blobs):
+@pytest.mark.parametrize("image_scale", [1.0, 0.5, 0.7])
+def test_pixel_centres_are_at_integers_and_scales_are_the_blobs(blobs, image_scale):
     """Half a pixel off would be COLMAP's origin, a quarter OpenCV's doubled image."""
     path, known = blobs
-    found = features_of(path, 10_000)
+    found = features_of(path, 10_000, image_scale)
     apart = np.linalg.norm(found.pixels[:, None] - known[None, :, :2], axis=-1)
     nearest = apart.argmin(0)
     there = apart.min(0) < 1.0
-    assert there.mean() > 0.9
+    assert there.mean() > (0.9 if image_scale > 0.6 else 0.6)  # reduced, the smallest are no blobs
     off = (found.pixels[nearest] - known[:, :2])[there]
     assert np.abs(off.mean(0)).max() < 0.03 and np.abs(off).max() < 0.2
     assert 0.75 < np.median(found.scales[nearest] / known[:, 2]) < 1.25
