@@ -80,10 +80,10 @@ def in_order(of: csr_array, sequence: list[int]) -> bool:
         return True
     own = np.array(sequence)
     asked = np.unique(np.linspace(0, len(own) - 2, ASKED_OF_ORDER).astype(np.int64))
-    shares = [
-        (np.delete(row, [k, k + 1]) <= row[k + 1]).mean()
-        for k, (_, row) in zip(asked, likeness(of, own[asked], own), strict=True)
-    ]
+    shares = []
+    for k, (_, row) in zip(asked, likeness(of, own[asked], own), strict=True):
+        more = np.sign(row[k + 1] - np.delete(row, [k, k + 1]))
+        shares.append(0.5 + 0.5 * more.mean())  # what is equally alike counts as half
     return float(np.mean(shares)) >= IN_ORDER
 
 
