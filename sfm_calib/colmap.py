@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -168,11 +168,18 @@ def _read_image(database: Path, path: str) -> pycolmap.Image:
     return image
 
 
-def read_descriptors(database: Path, path: str) -> NDArray[np.uint8]:
-    """SIFT descriptors (n, 128) of one image."""
-    image_id = _read_image(database, path).image_id
+@contextmanager
+def open_descriptors(scan: Scan, database: Path) -> Iterator[Callable[[int], NDArray[np.uint8]]]:
+    """A reader of the SIFT descriptors (n, 128) of an image by its number, the largest first."""
     with pycolmap.Database.open(database) as db:
-        return np.asarray(db.read_descriptors(image_id).data)
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+
+        def read(number: int) -> NDArray[np.uint8]:
+            key = ids[scan.images[number].path]
+            largest = np.argsort(-_scales(db, key), kind="stable")
+            return np.asarray(db.read_descriptors(key).data)[largest]
+
+        yield read
 
 
 def match_features(
@@ -184,8 +191,7 @@ def match_features(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed  # else threads share one stream of random numbers
     pairing = pycolmap.ImportedPairingOptions()
-    listing = database.with_name("pairs.txt")
-    pairing.match_list_path = listing
+    pairing.match_list_path = listing = database.with_name("pairs.txt")
     # COLMAP cuts the lines of its list at blanks, which paths may hold and numbers do not.
     numbers = {image.path: str(index) for index, image in enumerate(scan.images)}
     _rename_images(database, numbers)
@@ -231,14 +237,13 @@ def constrain_rig(
     """
     rig = pycolmap.RigConfig()
     cameras = []
-    for index, transform in enumerate(cam_from_rig):
+    for index, t in enumerate(cam_from_rig):
         camera = pycolmap.RigConfigCamera()
         first = next(image for image in scan.images if image.camera == index)
         camera.image_prefix = f"{Path(first.path).parent.as_posix()}/"
         camera.ref_sensor = index == reference
         if index != reference:
-            rotation = pycolmap.Rotation3d(transform.rotation)
-            camera.cam_from_rig = pycolmap.Rigid3d(rotation, transform.translation)
+            camera.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(t.rotation), t.translation)
         cameras.append(camera)
     rig.cameras = sorted(cameras, key=lambda camera: not camera.ref_sensor)  # wanted first
     with pycolmap.Database.open(database) as db:
@@ -285,10 +290,8 @@ def _is_whole(model: pycolmap.Reconstruction, folder: Path) -> bool:
         kept = pycolmap.Reconstruction(folder)
     except (ValueError, IndexError, RuntimeError, MemoryError):
         return False
-    return bool(
-        kept.num_points3D() == model.num_points3D()
-        and kept.num_reg_images() == model.num_reg_images()
-    )
+    counts = [(m.num_points3D(), m.num_reg_images()) for m in (kept, model)]
+    return bool(counts[0] == counts[1])
 
 
 def read_models(place: Path) -> list[pycolmap.Reconstruction]:
@@ -336,11 +339,14 @@ def map_images(
 def keypoint_scales(database: Path) -> dict[str, FloatArray]:
     """Sizes (n,) in px of the keypoints of each image, by path: how far their frames reach."""
     with pycolmap.Database.open(database) as db:
-        frames = {
-            image.name: np.asarray(db.read_keypoints(image.image_id), dtype=np.float64)[:, 2:6]
-            for image in db.read_all_images()
-        }
-    return {name: np.abs(np.linalg.det(a.reshape(-1, 2, 2))) ** 0.5 for name, a in frames.items()}
+        return {image.name: _scales(db, image.image_id) for image in db.read_all_images()}
+
+
+def _scales(db: pycolmap.Database, image_id: int) -> FloatArray:
+    found = np.asarray(db.read_keypoints(image_id), dtype=np.float64)
+    if found.shape[1] < 6:  # places alone
+        return np.ones(len(found))
+    return np.abs(np.linalg.det(found[:, 2:6].reshape(-1, 2, 2))) ** 0.5
 
 
 def free_model(

@@ -71,7 +71,8 @@ class Options(SolveOptions):
     frames: Literal["stem", "order"] = "stem"
     """Which images make one frame: the same file stem, or the same place in sorted order."""
     pairs: Literal["auto", "all", "selected"] = "auto"
-    """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
+    """Image pairs to match; selected: neighbours in time and on the rig, and images that look
+    alike; auto: all while matching them takes about three minutes, else selected."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
     """SIFT features an image, at most: 100 to 50000."""
     image_scale: Annotated[float, Field(ge=0.1, le=1)] = 1.0

@@ -150,7 +150,9 @@ def _map_coarsely(
     if not in_sequence(scan, counts):
         database.unlink()
         colmap.write_features(scan, lenses, known, found, database)
-        pairs = choose_pairs(scan, config.pairs, lambda i: found[i].descriptors, config.seed)
+        pairs = choose_pairs(
+            scan, config.pairs, lambda i: found[i].descriptors, config.seed, progress
+        )
         colmap.match_features(scan, pairs, database, config.seed, progress)
         counts = colmap.match_counts(scan, database)
     check_overlap(scan, counts)

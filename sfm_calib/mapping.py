@@ -11,7 +11,7 @@ from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
 from graphs.join import join_models
 from graphs.lenses import LensName
-from graphs.problem import Problem
+from graphs.problem import Problem, images_seen
 from graphs.rig_start import FreeModel, impose_rig, link_cameras
 from sfm_calib import colmap
 from sfm_calib.cache import Cache
@@ -24,6 +24,7 @@ from sfm_calib.pairs import Pair, choose_pairs
 from sfm_calib.worker import run_apart
 
 DATABASE = "database.db"
+LIKELY_PAIRS = "likely_pairs.txt"  # their number, beside the matches of a part of all pairs
 ENOUGH_REGISTERED = 0.9  # of the images; fewer, and mapping starts again elsewhere
 MIN_MATCHES = 15  # COLMAP's own minimum for a verified pair
 
@@ -80,6 +81,8 @@ def map_scan(
         problem, messages = problem_of(
             scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
         )
+    if len(images_seen(problem.observations)) < len(scan.images):
+        messages += _unmatched(scan, matches)
     return Mapped(problem, messages, hashes)
 
 
@@ -124,12 +127,10 @@ def _extract(
 def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress: Progress) -> None:
     shutil.copytree(features, place, dirs_exist_ok=True)
     database = place / DATABASE
-    pairs = choose_pairs(
-        scan,
-        config.pairs,
-        lambda i: colmap.read_descriptors(database, scan.images[i].path),
-        config.seed,
-    )
+    with colmap.open_descriptors(scan, database) as descriptors:
+        pairs = choose_pairs(scan, config.pairs, descriptors, config.seed, progress)
+    if len(pairs) < len(scan.images) * (len(scan.images) - 1) // 2:
+        (place / LIKELY_PAIRS).write_text(str(len(pairs)))
     colmap.match_features(scan, pairs, database, config.seed, progress)
     check_overlap(scan, colmap.match_counts(scan, database))
 
@@ -242,6 +243,18 @@ def _messages(scan: Scan, model: FreeModel, dropped: list[tuple[int, int]]) -> t
             f"together with the rest of their frame): {some(odd)}"
         )
     return tuple(messages)
+
+
+def _unmatched(scan: Scan, matches: Path) -> tuple[str, ...]:
+    """What to try where images are missing, and likely pairs alone were matched."""
+    likely = matches / LIKELY_PAIRS
+    if not likely.exists():
+        return ()
+    n = len(scan.images)
+    return (
+        f"{likely.read_text()} of {n * (n - 1) // 2} pairs of images were matched, those that "
+        "seemed likely: with --pairs all more images may be placed, in a longer time",
+    )
 
 
 def some(names: list[str]) -> str:

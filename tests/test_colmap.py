@@ -179,3 +179,26 @@ def test_a_mapped_camera_starts_any_lens(lens):
     ahead = rays[..., 2] > 0
     theirs = [model.img_from_cam(ray) for ray in rays[ahead]]
     np.testing.assert_allclose(grid()[ahead] + 0.5, theirs, atol=0.2)
+
+
+def test_descriptors_are_read_largest_first(tmp_path):
+    database, rng = tmp_path / "database.db", np.random.default_rng(0)
+    sizes, found = np.array([1.0, 4.0, 2.0]), rng.integers(0, 255, (3, 128)).astype(np.uint8)
+    images = tuple(ScanImage(0, frame, f"{frame}.png") for frame in range(3))
+    with pycolmap.Database.open(database) as db:
+        camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24])
+        number = db.write_camera(camera)
+        for image in reversed(images):  # numbered otherwise than in the scan
+            key = db.write_image(pycolmap.Image(name=image.path, camera_id=number))
+            columns = [np.ones(3), np.ones(3), *sizes * [[1], [0], [0], [1]]]
+            keypoints = np.stack(columns[: 2 if image.frame == 2 else 6], axis=1)
+            shown = keypoints[: 0 if image.frame == 1 else 3].astype(np.float32)
+            db.write_keypoints(key, shown)
+            sift = pycolmap.FeatureExtractorType.SIFT
+            own = found[: len(shown)] + np.uint8(image.frame)
+            db.write_descriptors(key, pycolmap.FeatureDescriptors(sift, own))
+    scan = Scan(tmp_path, ("a",), ((64, 48),), ("0", "1", "2"), images)
+    with colmap.open_descriptors(scan, database) as read:
+        np.testing.assert_array_equal(read(0), found[[1, 2, 0]])
+        assert read(1).shape == (0, 128)
+        np.testing.assert_array_equal(read(2), found + np.uint8(2))  # places alone: as they lie

@@ -2,10 +2,11 @@
 
 import shutil
 
+import cv2
 import pytest
-from synthetic.scans import QUICK, blank, picture, silent, simulation
+from synthetic.scans import QUICK, blank, panning_frames, picture, silent, simulation
 
-from sfm_calib import mapping
+from sfm_calib import mapping, pairs
 from sfm_calib.cache import Cache
 from sfm_calib.cli import main
 from sfm_calib.config import RigConfig
@@ -64,6 +65,27 @@ def test_a_camera_that_does_not_move(tmp_path, good, capsys):
     message = refusal(tmp_path / "static", tmp_path / "out", capsys)
     assert "none of 4 images could be placed" in message and "6 pairs match" in message
     assert "move the camera sideways" in message
+
+
+def test_it_is_said_where_likely_pairs_alone_were_matched(tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "OWN_STEPS", (1,))
+    monkeypatch.setattr(pairs, "RANKS", (0,))
+    (tmp_path / "scan").mkdir()
+    for number, image in enumerate(panning_frames(6, size=(160, 120))):
+        assert cv2.imwrite(str(tmp_path / "scan" / f"{number}.png"), image)
+    scan = read_scan(tmp_path / "scan", Cache(tmp_path / "cache"), "stem", 10, silent)
+    folders = [tmp_path / name for name in ("features", "selected", "all")]
+    for folder in folders:
+        folder.mkdir()
+    config = RigConfig(max_features=200)
+    mapping._extract(scan, config, ["radtan"], {}, folders[0], silent)
+    for folder in folders[1:]:
+        chosen = config.model_copy(update={"pairs": folder.name})
+        mapping._match(scan, chosen, folders[0], folder, silent)
+    (said,) = mapping._unmatched(scan, folders[1])
+    n_pairs = int(said.split()[0])
+    assert 5 <= n_pairs < 15 and "of 15 pairs" in said and "--pairs all" in said
+    assert mapping._unmatched(scan, folders[2]) == ()
 
 
 @pytest.mark.parametrize(
