@@ -40,6 +40,7 @@ CLEARLY_UNLIKE, MUCH_MORE = 0.1, 15.0
 FLOOR_PX = 0.01  # of the sigma: what interpolating and a surface's shape leave at the least
 LEAST_MATCHED = 0.2  # of the observations: of scans that went well nine in ten are
 MOST_ROUNDS = 3
+WHO = "matching patches"  # in messages, where it is ended from outside
 WARP_CHANGED = 0.03  # of its size: a patch's edge then lies a fifth of a sample elsewhere
 
 
@@ -168,7 +169,9 @@ def _matched(
     place = cache.stage(
         f"patches{number}",
         [_digest(sights), scan.hashes, options.device, torch_versions()],
-        lambda to: run_apart(match_patches, (sights, options.device, thread_count(), to), progress),
+        lambda to: run_apart(
+            match_patches, (sights, options.device, thread_count(), to), progress, WHO
+        ),
     )
     found = load_matches(place)
     pixels, cov_px, linear = (one.copy() for one in (state.pixels, state.cov_px, state.linear))

@@ -137,13 +137,14 @@ class Sigmas(Record):
 
 
 class NoiseBySize(Record):
-    """The noise of one camera's keypoints of about one size."""
+    """The noise of one camera's keypoints of about one size, or one sigma."""
 
-    smallest_px: float | None  # scale of the keypoints, from; None: their sizes are not known
-    largest_px: float | None  # to
+    smallest_px: float | None  # their scale, or what matching states as sigma; None: unknown
+    largest_px: float | None
     n_observations: int
     sigma_px: float  # robust, of one pixel coordinate
     of_board: bool = False  # corners of the board
+    matched: bool = False  # by their patches (--refine)
 
 
 class Noise(Record):
@@ -152,9 +153,7 @@ class Noise(Record):
     sigma_px: float  # robust sigma of one pixel coordinate
     inflation: float = 1.0  # median of stated sigma / model sigma
     by_size: dict[str, tuple[NoiseBySize, ...]] = Field(default_factory=dict)  # of each camera
-    sigmas: dict[str, Sigmas] = Field(
-        default_factory=dict
-    )  # of each parameter, by its name in the covariance
+    sigmas: dict[str, Sigmas] = Field(default_factory=dict)  # of each parameter of the covariance
 
 
 class ProjectionSigma(Record):

@@ -74,6 +74,7 @@ def _noise(run: Run) -> result.Noise:
                 n_observations=one.count,
                 sigma_px=one.sigma_px,
                 of_board=one.of_board,
+                matched=one.kind == "matched",
             )
         )
     jackknife = covariance.jackknife

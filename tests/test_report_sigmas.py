@@ -299,3 +299,16 @@ def test_large_keypoints_are_not_mismatches(case: Case) -> None:
         part = residuals_by_camera(one, estimate, 0.05)[0]
         assert ((part.norms > part.limits_px).mean() > 0.5) == lost
         assert f"typically {part.sigma_px:.2f} px" in summary(part)
+
+
+def test_noise_by_what_matching_states(case: Case) -> None:
+    """With a line that says where it would be as stated."""
+    matched = tuple(one.model_copy(update={"matched": True}) for one in sizes())
+    noise = Noise(sigma_px=0.4, by_size={"left": matched})
+    panel = noise_panel(case[0].model_copy(update={"noise": noise}))
+    assert panel is not None and panel.title == "Noise by what matching states"
+    figure = noise_figure({"left": matched})
+    line = next(trace for trace in figure.data if trace.name == "as stated")
+    ends = (matched[0].smallest_px, matched[-1].largest_px)
+    assert tuple(line.x) == tuple(line.y) == ends
+    assert "stated sigma" in figure.layout.xaxis.title.text

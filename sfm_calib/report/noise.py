@@ -1,4 +1,5 @@
-"""How well keypoints were located, by their size: large ones are blurred, and err more."""
+"""How well keypoints were located: by their size, for large ones are blurred and err more, or by
+the sigma that the matching of their patches states."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from sfm_calib.report.digits import short
 from sfm_calib.report.theme import Panel, camera_colour, figure_html, plain, styled
 from sfm_calib.result import Calibration, NoiseBySize
 
-TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
 Classes = dict[str, tuple[NoiseBySize, ...]]
 
 
@@ -19,12 +20,24 @@ def noise_panel(calibration: Calibration) -> Panel | None:
     known = {name: _known(classes) for name, classes in by_size.items()}
     if not any(known.values()):
         return None
-    said = [_said(name, classes) for name, classes in known.items() if classes]
+    said = " ".join(_said(name, classes) for name, classes in known.items() if classes)
+    figure = figure_html(noise_figure(known), "noise-by-size")
+    if _matched(known):
+        return Panel(
+            "Noise by what matching states",
+            "Every observation is weighed by the sigma and shape that the matching of its patch "
+            f"states, corrected by what the residuals of its like show. {said} Dotted: as stated.",
+            figure,
+        )
     return Panel(
         "Noise by the size of keypoints",
-        "Every observation is weighed by the noise of its camera and size. " + " ".join(said),
-        figure_html(noise_figure(known), "noise-by-size"),
+        f"Every observation is weighed by the noise of its camera and size. {said}",
+        figure,
     )
+
+
+def _matched(known: Classes) -> bool:
+    return any(one.matched for classes in known.values() for one in classes)
 
 
 def _known(classes: tuple[NoiseBySize, ...]) -> tuple[NoiseBySize, ...]:
@@ -39,8 +52,9 @@ def _said(name: str, classes: tuple[NoiseBySize, ...]) -> str:
 
 
 def noise_figure(known: Classes) -> go.Figure:
-    """Sigma of one pixel coordinate against keypoint scale, a line a camera."""
+    """Sigma of one pixel coordinate against keypoint scale, or stated sigma, a line a camera."""
     figure = go.Figure()
+    what = "stated sigma" if _matched(known) else "scale of the keypoint"
     for index, (name, classes) in enumerate(known.items()):
         ends = np.array([(one.smallest_px, one.largest_px) for one in classes]).reshape(-1, 2)
         figure.add_scatter(
@@ -53,12 +67,22 @@ def noise_figure(known: Classes) -> go.Figure:
                 (f"{one.smallest_px:.2g} to {one.largest_px:.2g}", f"{one.n_observations:,}")
                 for one in classes
             ],
-            hovertemplate="scale %{customdata[0]} px<br>sigma %{y:.3f} px"
+            hovertemplate=f"{what} %{{customdata[0]}} px<br>sigma %{{y:.3f}} px"
             "<br>%{customdata[1]} observations",
         )
+    if _matched(known):
+        stated = [one for classes in known.values() for one in classes]
+        ends_px = (
+            min(one.smallest_px or np.inf for one in stated),
+            max(one.largest_px or 0.0 for one in stated),
+        )
+        figure.add_scatter(
+            x=ends_px, y=ends_px, mode="lines", name="as stated", hoverinfo="skip",
+            line={"color": "gray", "dash": "dot", "width": 1},
+        )  # fmt: skip
     styled(figure, height=330)
     figure.update_xaxes(
-        title="scale of the keypoint, px",
+        title=f"{what}, px",
         type="log",
         tickvals=TICKS,
         ticktext=[f"{tick:g}" for tick in TICKS],
