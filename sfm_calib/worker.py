@@ -35,8 +35,8 @@ def run_apart(
 ) -> None:
     """Call `work(*arguments, progress)` in another process; a function of a module, and values.
 
-    who: does the work, as messages call it. Raises what `work` raises, OSError when it died of a full disk, and BrokenDownError when it
-    died of anything else.
+    who: does the work, as messages call it. Raises what `work` raises, OSError when it died of a
+    full disk, and BrokenDownError when it died of anything else.
     """
     reading, writing = os.pipe()
     job = (work, tuple(arguments), colmap.is_verbose())
