@@ -13,7 +13,7 @@ from synthetic.walls import CAMERA, DISTANCES, NORMALS, Scene, Walls, scene
 from graphs.camera import project
 from graphs.frames import FloatArray
 from graphs.noise import RAYLEIGH_MEDIAN
-from graphs.problem import BoolArray
+from graphs.problem import BoolArray, residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.patches import match
 from sfm_calib.patches.crops import Images, cut_out
@@ -48,23 +48,23 @@ def errors(one: Scene, found: Matches, good: BoolArray | None = None) -> FloatAr
     """
     start, seen = one.true.initial, one.true.observations
     good = np.ones(len(seen), dtype=bool) if good is None else good
-    result = np.full((len(seen), 2), np.nan)
-    for point in np.unique(seen.point[good]):
-        rows = np.flatnonzero((seen.point == point) & good)
-        views = [start.rig_from_world[frame] for frame in seen.frame[rows]]
-        place = start.points[point]
-        wall = NORMALS[np.argmin(np.abs(NORMALS @ place - DISTANCES))]
-        along = np.linalg.svd(wall[None])[2][1:]
+    n = len(start.points)
+    wall = np.abs(start.points @ NORMALS.T - DISTANCES).argmin(1)
+    along = np.linalg.svd(NORMALS[wall][:, None])[2][:, 1:]  # (n, 2, 3)
 
-        def shown(at: FloatArray, views=views) -> FloatArray:
-            return np.array([project(CAMERA, view @ at) for view in views])
+    def shown(places: FloatArray) -> FloatArray:
+        return seen.pixels + residuals_px(replace(start, points=places), seen)
 
-        for _ in range(3):
-            off = found.pixels[rows] - shown(place)
-            slope = [(shown(place + 1e-6 * d) - shown(place)).ravel() / 1e-6 for d in along]
-            place = place + np.linalg.lstsq(np.array(slope).T, off.ravel(), rcond=None)[0] @ along
-        result[rows] = found.pixels[rows] - shown(place)
-    return result
+    places = start.points
+    for _ in range(3):
+        now = shown(places)
+        slope = [(shown(places + 1e-6 * along[:, k]) - now) / 1e-6 for k in range(2)]
+        J = np.stack(slope, -1) * good[:, None, None]
+        H, g = 1e-12 * np.tile(np.eye(2), (n, 1, 1)), np.zeros((n, 2))
+        np.add.at(H, seen.point, J.mT @ J)
+        np.add.at(g, seen.point, np.einsum("nij,ni->nj", J, found.pixels - now))
+        places = places + np.einsum("nk,nkj->nj", np.linalg.solve(H, g[..., None])[..., 0], along)
+    return found.pixels - shown(places)
 
 
 def left(one: Scene) -> FloatArray:

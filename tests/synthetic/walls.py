@@ -6,6 +6,7 @@ The texture is a sum of waves, so that it can be had anywhere and has nothing fi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -47,20 +48,28 @@ class Walls:
             result[rows] = np.cos(angle).sum(1)
         return 128 + self.contrast * result / np.sqrt(WAVES / 2)
 
-    def image(self, camera: Camera, cam_from_world: Transform) -> FloatArray:
-        """What a camera sees (height, width), not rounded, without noise."""
-        width, height = camera.size
-        x, y = np.meshgrid(np.arange(width), np.arange(height))
-        pixels = np.stack([x.ravel(), y.ravel()], 1)
-        return self.grey(*seen_at(camera, cam_from_world, pixels)).reshape(height, width)
+    def image(self, cam_from_world: Transform) -> FloatArray:
+        """What the camera sees (height, width), not rounded, without noise."""
+        width, height = CAMERA.size
+        return self.grey(*_along(rays_of_pixels(), cam_from_world)).reshape(height, width)
 
 
-def seen_at(
-    camera: Camera, cam_from_world: Transform, pixels: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def seen_at(cam_from_world: Transform, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (n, 3) of the walls at pixels (n, 2), and which wall (n,) each is on."""
+    return _along(unproject(CAMERA, pixels), cam_from_world)
+
+
+@cache
+def rays_of_pixels() -> FloatArray:
+    """Rays (n, 3) of every pixel of the camera, row by row."""
+    width, height = CAMERA.size
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    return unproject(CAMERA, np.stack([x.ravel(), y.ravel()], 1))
+
+
+def _along(rays: FloatArray, cam_from_world: Transform) -> tuple[FloatArray, FloatArray]:
     world_from_cam = cam_from_world.inverse
-    rays = unproject(camera, pixels) @ world_from_cam.rotation.T
+    rays = rays @ world_from_cam.rotation.T
     origin = world_from_cam.translation
     with np.errstate(divide="ignore"):
         away = (DISTANCES - NORMALS @ origin) / (rays @ NORMALS.T)
@@ -93,13 +102,13 @@ def scene(
     """
     rng, walls = np.random.default_rng(seed), walls or Walls.drawn(seed)
     placed = [_place(i, n_frames) for i in range(n_frames)]
-    clean = [walls.image(CAMERA, t) for t in placed]
+    clean = [walls.image(t) for t in placed]
     images = [
         np.clip(np.round(c + noise * rng.standard_normal(c.shape)), 0, 255).astype(np.uint8)
         for c in clean
     ]
     first = rng.uniform([6, 6], [314, 234], (n_points, 2))
-    points, _ = seen_at(CAMERA, placed[0], first)
+    points, _ = seen_at(placed[0], first)
     rows = [
         (pixel, frame, point)
         for frame, cam_from_world in enumerate(placed)
