@@ -14,7 +14,14 @@ from numba import njit
 
 from graphs.camera import focal_on_axis, unproject
 from graphs.frames import FloatArray
-from graphs.problem import BoolArray, Estimate, IntArray, Observations, residuals_px
+from graphs.problem import (
+    BoolArray,
+    Estimate,
+    IntArray,
+    Observations,
+    Problem,
+    residuals_px,
+)
 
 GATE_PX = 4.0  # COLMAP's; what is beyond the noise but within, the graph's own rounds reject
 MOST_POINTS = 4  # that a track is taken apart into
@@ -35,6 +42,34 @@ def join_matches(image: IntArray, links: IntArray, likeness: FloatArray) -> IntA
     track = np.full(len(image), -1)
     track[~alone] = np.unique(root[~alone], return_inverse=True)[1]
     return track
+
+
+def joined_at_spots(problem: Problem) -> Problem:
+    """The problem with tracks that meet at one pixel of an image as one track.
+
+    A blob with two orientations is two features of SIFT's, a fifth of all are such, and their
+    tracks say the same twice. Where joining would give a track two pixels of one image it stays
+    apart; the longer track's point is taken.
+    """
+    seen, points = problem.observations, problem.initial.points
+    image = seen.camera * len(problem.frame_names) + seen.frame
+    places = np.column_stack([image, seen.pixels])
+    _, first, spot = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    spot = spot.ravel()
+    order = np.lexsort((image, seen.point))
+    linked = np.flatnonzero(np.diff(seen.point[order]) == 0)
+    links = np.stack([spot[order[linked]], spot[order[linked + 1]]], axis=1)
+    length = np.bincount(seen.point)
+    track = join_matches(image[first], links, length[seen.point[order[linked]]].astype(np.float64))
+    rows, track = first[track >= 0], track[track >= 0]
+    shortest_first = np.argsort(length[seen.point[rows]], kind="stable")
+    placed = np.empty((int(track.max(initial=-1)) + 1, 3))
+    placed[track[shortest_first]] = points[seen.point[rows[shortest_first]]]
+    return replace(
+        problem,
+        initial=replace(problem.initial, points=placed),
+        observations=replace(seen.subset(rows), point=track),
+    )
 
 
 @njit(cache=True)

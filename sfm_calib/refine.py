@@ -21,6 +21,7 @@ from graphs.refine import ROUGH_LOSS, ROUGH_STEPS, ROUND_TOLERANCES, noise_of, r
 from graphs.selection import compact, select_tracks, well_seen
 from graphs.solve import solve
 from graphs.threads import thread_count
+from graphs.track_building import joined_at_spots
 from sfm_calib.cache import Cache
 from sfm_calib.config import Options
 from sfm_calib.errors import CalibrationError
@@ -80,7 +81,7 @@ def refine_tracks(
     """
     check_torch("--refine")
     rough = refine(
-        problem, graph_options, options.min_parallax_deg, options.max_observations,
+        joined_at_spots(problem), graph_options, options.min_parallax_deg, options.max_observations,
         on_iteration=lambda iteration, cost: progress("solving roughly", iteration, 0),
     ).problem  # fmt: skip
     state = _State.before(rough)

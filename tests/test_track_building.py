@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from synthetic.problems import small_problem
 
 from graphs.problem import Observations, joined
-from graphs.track_building import GATE_PX, consistent_tracks, join_matches, nearest_points
+from graphs.track_building import (
+    GATE_PX,
+    consistent_tracks,
+    join_matches,
+    joined_at_spots,
+    nearest_points,
+)
 
 
 @settings(max_examples=50, deadline=None)
@@ -130,3 +136,58 @@ def test_near_and_far_rays_count_by_their_angle():
     found = nearest_points(centres, rays, np.zeros(4, dtype=np.int64))[0]
     # Along y: two rays through 0 and two through 30 off, by angle 900 times less.
     assert found[1] == pytest.approx(30 * off / 901, rel=0.2)
+
+
+# ---- blobs of two orientations --------------------------------------------------------------
+
+
+def as_rows(problem, names):
+    """Tracks as sets of (frame, pixel name), by the names that stand for pixels."""
+    seen = problem.observations
+    tracks = {}
+    for frame, pixel, point in zip(seen.frame, seen.pixels, seen.point, strict=True):
+        tracks.setdefault(int(point), set()).add((int(frame), names[tuple(pixel)]))
+    return sorted(map(sorted, tracks.values()))
+
+
+def problem_of_tracks(tracks):
+    """One camera; each track a dictionary from frame to a number that makes its pixel."""
+    problem, _ = small_problem(cameras=1, frames=6, points=30)
+    rows = [(f, k, i) for i, track in enumerate(tracks) for f, k in track.items()]
+    frame, name, point = np.array(rows).T
+    pixels = np.column_stack([10.0 * name, 7.0 * frame + 0.25])
+    names = {tuple(p): int(k) for p, k in zip(pixels, name, strict=True)}
+    seen = Observations(pixels, frame, np.zeros_like(frame), point)
+    points = np.arange(3.0 * len(tracks)).reshape(-1, 3)
+    initial = replace(problem.initial, points=points)
+    return replace(problem, initial=initial, observations=seen), names
+
+
+def test_tracks_that_meet_are_one_and_keep_the_longer_ones_point():
+    problem, names = problem_of_tracks([{0: 1, 1: 2}, {1: 2, 2: 3, 3: 4}, {4: 5, 5: 6}])
+    joined_problem = joined_at_spots(problem)
+    assert as_rows(joined_problem, names) == [
+        [(0, 1), (1, 2), (2, 3), (3, 4)],
+        [(4, 5), (5, 6)],
+    ]
+    of_longest = joined_problem.initial.points[joined_problem.observations.point[0]]
+    np.testing.assert_array_equal(of_longest, problem.initial.points[1])
+
+
+def test_tracks_that_contradict_each_other_stay_apart():
+    """They meet in frame 1, and show different pixels of frame 2: the longer has the spot."""
+    problem, names = problem_of_tracks([{1: 2, 2: 9, 3: 8}, {0: 1, 1: 2, 2: 3, 4: 4}])
+    found = as_rows(joined_at_spots(problem), names)
+    assert [(0, 1), (1, 2), (2, 3), (4, 4)] in found
+    for track in found:
+        assert len({frame for frame, _ in track}) == len(track)
+
+
+def test_where_nothing_meets_nothing_changes():
+    problem, _ = small_problem(points=40)
+    same = joined_at_spots(problem).observations
+    before = {tuple(p): q for p, q in zip(problem.observations.pixels, problem.observations.point,
+                                          strict=True)}  # fmt: skip
+    pairs = {(before[tuple(p)], int(q)) for p, q in zip(same.pixels, same.point, strict=True)}
+    assert len(same) == len(problem.observations)
+    assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs}) == 40
