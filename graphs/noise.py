@@ -167,7 +167,7 @@ def noise_classes(
     for camera, rows, of_board in _classes(problem, np.isfinite(lengths)):
         sigma_px = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN
         ends = (0.0, np.inf)
-        if size is not None and not of_board:
+        if size is not None and not of_board and np.isfinite(size[rows]).all():
             ends = (float(size[rows].min()), float(size[rows].max()))
         found.append(NoiseClass(camera, *ends, len(rows), sigma_px, of_board))
     return tuple(found)

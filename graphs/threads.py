@@ -13,10 +13,15 @@ from threadpoolctl import threadpool_limits
 _MOST: ContextVar[int | None] = ContextVar("most_threads", default=None)
 
 
-def threads() -> ThreadPoolExecutor:
-    """A thread for each core that this process may use, as far as `at_most` lets it."""
+def thread_count() -> int:
+    """How many cores this process may use, as far as `at_most` lets it."""
     cores, most = len(os.sched_getaffinity(0)), _MOST.get()
-    return ThreadPoolExecutor(cores if most is None else min(cores, most))
+    return cores if most is None else min(cores, most)
+
+
+def threads() -> ThreadPoolExecutor:
+    """A thread for each of them."""
+    return ThreadPoolExecutor(thread_count())
 
 
 @contextmanager

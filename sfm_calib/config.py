@@ -72,8 +72,18 @@ class Options(SolveOptions):
     """Which images make one frame: the same file stem, or the same place in sorted order."""
     pairs: Literal["auto", "all", "selected"] = "auto"
     """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
+    features: Literal["sift", "xfeat", "aliked", "disk"] = "sift"
+    """What is tracked: SIFT, or what a network finds (extra `learned`, and weights)."""
+    matcher: Literal["auto", "nearest", "lightglue"] = "auto"
+    """How features are matched: with the nearest in the other image, or by LightGlue; auto: the
+    nearest."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Weights of the networks, a file or a folder; default: those of an installed package, or
+    fetched."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where networks run."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
-    """SIFT features an image, at most: 100 to 50000."""
+    """Features an image, at most: 100 to 50000."""
     min_parallax_deg: Annotated[float, Field(ge=0, le=90)] = 1.0
     """Points seen under a smaller angle are left out: they say little and harm the solve."""
     max_observations: Annotated[int, Field(ge=1000)] = MAX_OBSERVATIONS
