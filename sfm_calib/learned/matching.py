@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,21 +69,27 @@ def nearest_matcher(device: Device) -> Matcher:
             return np.zeros((0, 2), np.int64)
         with torch.inference_mode():
             first, second = (torch.from_numpy(f.descriptors).to(device) for f in (a, b))
-            likeness, there = _two_nearest(torch, first, second)
-            back = _two_nearest(torch, second, first)[1][:, 0]
-            apart = (2 - 2 * likeness).clamp(min=0)  # squared, of unit vectors
-            rows = torch.arange(len(first), device=first.device)
-            clear = apart[:, 0] <= MAX_RATIO**2 * apart[:, 1]
-            kept = (back[there[:, 0]] == rows) & clear
-            return torch.stack([rows[kept], there[kept, 0]], 1).cpu().numpy().astype(np.int64)
+            rows, there = _clear_and_mutual(torch, first, second)
+            return torch.stack([rows, there], 1).cpu().numpy().astype(np.int64)
 
     return matcher
 
 
-def _two_nearest(torch: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """Cosines to and indices of the two descriptors of b (m, d) nearest to each of a (n, d)."""
-    parts = [(rows @ b.T).topk(2, dim=1) for rows in a.split(ROWS_AT_ONCE)]
-    return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
+def _clear_and_mutual(torch: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    """Rows of unit vectors a (n, d) and b (m, d) that are each other's nearest, and clearly so."""
+    best, there = [], []
+    best_of_b = a.new_full((len(b),), -math.inf)
+    for rows in a.split(ROWS_AT_ONCE):
+        likeness = rows @ b.T
+        two = likeness.topk(2, dim=1)
+        best.append(two.values)
+        there.append(two.indices[:, 0])
+        best_of_b = torch.maximum(best_of_b, likeness.amax(0))
+    nearest, index = torch.cat(best), torch.cat(there)
+    apart = (2 - 2 * nearest).clamp(min=0)  # squared
+    clear = apart[:, 0] <= MAX_RATIO**2 * apart[:, 1]
+    kept = torch.nonzero(clear & (nearest[:, 0] == best_of_b[index]))[:, 0]
+    return kept, index[kept]
 
 
 def lightglue_matcher(name: FeatureName, path: Path, device: Device) -> Matcher:
