@@ -55,8 +55,8 @@ def map_scan(
 
     Raises CalibrationError when images do not overlap, or a camera cannot be placed.
     """
-    hashes = scan.hashes
     learned = choose(config)
+    hashes, who = scan.hashes, learned.name if learned else "COLMAP"
     inputs: list[object] = [
         hashes, scan.cameras, lenses, config.max_features,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
@@ -65,14 +65,16 @@ def map_scan(
     features = cache.stage(
         "features",
         inputs,
-        lambda place: run_apart(_extract, (scan, config, lenses, known, learned, place), progress),
+        lambda place: run_apart(
+            _extract, (scan, config, lenses, known, learned, place), progress, who
+        ),
     )
     inputs += [scan.frames, config.pairs, config.seed]
     inputs += learned.matches_from if learned else []
     matches = cache.stage(
         "matches",
         inputs,
-        lambda place: run_apart(_match, (scan, config, features, learned, place), progress),
+        lambda place: run_apart(_match, (scan, config, features, learned, place), progress, who),
     )
     database, reference = matches / DATABASE, reference_of(scan, config)
     nominal = nominal_rig(config, scan.cameras, reference)
@@ -89,7 +91,7 @@ def map_scan(
         problem, messages = problem_of(
             scan, config, lenses, place, database, lambda: colmap.keypoint_scales(database)
         )
-    return Mapped(problem, messages, hashes)
+    return Mapped(problem, messages, hashes | (learned.hashes if learned else {}))
 
 
 def problem_of(

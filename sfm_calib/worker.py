@@ -27,9 +27,12 @@ EPITAPHS = (r"what\(\):\s*(?:\[[^\]]*\]\s*)?(.+)", r"^F\d{8} [^\]]*\]\s*(.+)")
 DISK_FULL = ("disk is full", "No space left on device")
 
 
-def run_apart(work: Callable[..., None], arguments: Sequence[object], progress: Progress) -> None:
+def run_apart(
+    work: Callable[..., None], arguments: Sequence[object], progress: Progress, who: str = "COLMAP"
+) -> None:
     """Call `work(*arguments, progress)` in another process; a function of a module, and values.
 
+    who: does the work, as messages begin.
     Raises what `work` raises, OSError when it died of a full disk, and BrokenDownError when it
     died of anything else.
     """
@@ -46,7 +49,7 @@ def run_apart(work: Callable[..., None], arguments: Sequence[object], progress: 
         )
         os.close(writing)
         try:
-            outcome = _supervise(process, job, messages, progress)
+            outcome = _supervise(process, job, messages, progress, who)
         finally:
             process.kill()
             process.wait()
@@ -65,7 +68,11 @@ def _close(stream: IO[bytes] | None) -> None:
 
 
 def _supervise(
-    process: subprocess.Popen[bytes], job: object, messages: IO[bytes], progress: Progress
+    process: subprocess.Popen[bytes],
+    job: object,
+    messages: IO[bytes],
+    progress: Progress,
+    who: str,
 ) -> BaseException | None:
     """Pass progress on until the worker says how it ended, or ends without a word."""
     assert process.stdin is not None and process.stderr is not None
@@ -83,7 +90,7 @@ def _supervise(
     except (EOFError, BrokenPipeError, pickle.UnpicklingError):
         process.wait()
         listener.join(1)
-        return _cause_of_death(process.returncode, log)
+        return _cause_of_death(process.returncode, log, who)
 
 
 def _listen(stream: IO[bytes], log: list[str]) -> None:
@@ -95,19 +102,19 @@ def _listen(stream: IO[bytes], log: list[str]) -> None:
             print(text, file=sys.stderr)
 
 
-def _cause_of_death(code: int, log: list[str]) -> BaseException:
+def _cause_of_death(code: int, log: list[str], who: str) -> BaseException:
     matches = (re.search(pattern, line) for line in log for pattern in EPITAPHS)
     reason = next((match.group(1).strip() for match in matches if match), "")
     if any(sign in reason for sign in DISK_FULL):
         return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     if code == -signal.SIGKILL:
         return BrokenDownError(
-            "COLMAP was killed, most likely because memory ran out: give a smaller --max-features, "
-            "or use a machine with more memory"
+            f"{who} was killed, most likely because memory ran out: give a smaller "
+            "--max-features, or use a machine with more memory"
         )
     how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     return BrokenDownError(
-        f"COLMAP broke down ({how}{': ' + reason if reason else ''}): run again with -v to see "
+        f"{who} broke down ({how}{': ' + reason if reason else ''}): run again with -v to see "
         "its log"
     )
 

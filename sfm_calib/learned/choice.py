@@ -22,6 +22,12 @@ class Learned:
     device: Device
 
     @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the weights, by their files' names."""
+        files = (self.weights, self.lightglue)
+        return {file.name: sha256(file) for file in files if file is not None}
+
+    @property
     def features_from(self) -> list[object]:
         """All that makes the features besides the images, for the cache."""
         return [self.name, sha256(self.weights), self.device, torch_versions()]
@@ -45,6 +51,15 @@ def check_choice(config: RigConfig) -> None:
         raise CalibrationError(
             f"weights {config.weights} is given, and features is sift, which needs none: add "
             "--features aliked (or xfeat, disk), or leave the weights out"
+        )
+
+
+def refuse_learned(config: RigConfig, command: str) -> None:
+    """Raises CalibrationError for learned features: `command` knows SIFT's alone."""
+    if config.features != "sift":
+        raise CalibrationError(
+            f"{command} tracks SIFT features alone, and features is {config.features}: say "
+            "--features sift, or run calibrate and compare the two"
         )
 
 

@@ -26,6 +26,7 @@ n16rot (three in four), not DISK (one in four) or XFeat, which it makes worse.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,6 +41,9 @@ PURPOSE = "learned features"
 STRIDE = 32  # of pixels: every network's maps then are as large as the image
 WINDOW = 5  # pixels, in which a feature is the only maximum: kornia's
 TINY = 1e-9  # likelihoods above have a logarithm
+CELL = 8  # pixels, XFeat's
+CELL_STEP = 2
+UNLIKELY = 1e-4  # in a cell: what is below counts as this
 FEWEST_TO_JUDGE = 50  # features of one image, to say whether a half turn keeps them
 # Of them: on nine images of five cameras ALIKED's n16rot keeps 0.81 to 1.19, its n16 0.02 to 0.18.
 LEFT_OF_TURNED = 0.4
@@ -85,9 +89,8 @@ def _xfeat(path: Path, device: Device) -> Detector:
 
     def maps(image: Any) -> Maps:
         size = image.shape[2:]
-        descriptors, logits, reliable = network.net(image)
-        # 64 pixels of a cell and one more for "none": kornia's Convention of XFeatModel.
-        likely = functional.pixel_shuffle(logits.softmax(1)[:, :64], 8)
+        descriptors, _, reliable = network.net(image)
+        peaks = _without_cells(network.net, image)
         reliable = functional.interpolate(reliable, size=size, mode="bilinear", align_corners=False)
         normed = functional.normalize(descriptors, dim=1)
 
@@ -95,9 +98,32 @@ def _xfeat(path: Path, device: Device) -> Detector:
             sampled = network.interpolator(normed, pixels[None], H=size[0], W=size[1])
             return functional.normalize(sampled[0], dim=-1)
 
-        return Maps((likely[0, 0] + TINY).log(), (likely * reliable)[0, 0], describe)
+        return Maps(peaks, peaks + (reliable[0, 0] + TINY).log(), describe)
 
     return Detector(maps, math.log(network.detection_threshold), False, 64, path)
+
+
+def _without_cells(network: Any, image: Any) -> Any:
+    """XFeat's map (h, w), the mean over cells that begin at every second pixel.
+
+    It looks for a feature in a cell of 8 x 8 pixels at a time, of which it sees nothing but these
+    64: where its cells happen to begin moves the features by half a pixel.
+    """
+    torch = import_torch(PURPOSE)
+    functional = torch.nn.functional
+    height, width = image.shape[2:]
+    normed = network.norm(image.mean(1, keepdim=True))
+    beyond = functional.pad(normed, (CELL, CELL, CELL, CELL), mode="replicate")
+    total = normed.new_zeros((height, width))
+    shifts = range(0, CELL, CELL_STEP)
+    for down, right in itertools.product(shifts, shifts):
+        part = beyond[..., down : down + height + CELL, right : right + width + CELL]
+        logits = network.keypoint_head(functional.pixel_unshuffle(part, CELL))
+        # 64 pixels of a cell and one more for "none": kornia's Convention of XFeatModel.
+        likely = functional.pixel_shuffle(logits.softmax(1)[:, : CELL**2], CELL)[0, 0]
+        top, left = CELL - down, CELL - right
+        total += (likely[top : top + height, left : left + width] + UNLIKELY).log()
+    return total / len(shifts) ** 2
 
 
 def _aliked(path: Path, device: Device) -> Detector:
