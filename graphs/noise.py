@@ -182,7 +182,9 @@ def noise_classes(
     for camera, rows, kind in _classes(problem, np.isfinite(lengths)):
         sigma_px = float(np.median(lengths[rows])) / RAYLEIGH_MEDIAN
         by = {"matched": seen.matched_sigma_px, "keypoints": seen.feature_scale}.get(kind)
-        ends = (0.0, np.inf) if by is None else (float(by[rows].min()), float(by[rows].max()))
+        ends = (0.0, np.inf)
+        if by is not None and np.isfinite(by[rows]).all():
+            ends = (float(by[rows].min()), float(by[rows].max()))
         found.append(NoiseClass(camera, *ends, len(rows), sigma_px, kind))
     return tuple(found)
 

@@ -1,4 +1,4 @@
-"""COLMAP through pycolmap: features, matches, mapping. The only module that knows its +0.5.
+"""COLMAP through pycolmap: features and mapping. The only module that knows its +0.5.
 
 COLMAP puts (0.5, 0.5) at the centre of the top-left pixel; everything handed out of here has
 integer pixel centres.
@@ -27,13 +27,11 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.features import Features
 from sfm_calib.images import Progress, Scan
 from sfm_calib.mapping_attempts import MappingAttempt
-from sfm_calib.pairs import Pair
 
 VERSION = pycolmap.__version__
 Model = pycolmap.Reconstruction
 PIXEL_OFFSET = 0.5
 IMAGES_A_BATCH = 10  # progress and Ctrl-C between batches
-PAIRS_A_BATCH = 200
 GLOBAL_ADJUSTMENT_GROWTH = 1.3  # of the model between two global adjustments
 LONGEST_SIDE = 3200  # px, COLMAP's own limit: features of larger images are found in reduced ones
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's own guess
@@ -54,7 +52,7 @@ def is_verbose() -> bool:
 
 
 @contextmanager
-def _colmap_errors() -> Iterator[None]:
+def colmap_errors() -> Iterator[None]:
     """COLMAP's exceptions as ours; what aborts it instead is the worker's to tell."""
     try:
         yield
@@ -105,34 +103,67 @@ def extract_features(
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.sift.max_num_features = max_features
-    with pycolmap.Database.open(database):
-        pass  # importing images wants it to exist
+    # Imported in order first: extraction numbers images as its threads finish them.
+    import_images(scan, lenses, known, database)
     done = 0
     for index in range(len(scan.cameras)):
         longest = min(max(scan.sizes[index]), LONGEST_SIDE)
         options.max_image_size = round(image_scale * longest)
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = MAPPING_MODEL[lenses[index]]
-        reader.default_focal_length_factor = DEFAULT_FOCAL
-        guess = fisheye_guess(reader.camera_model, scan.cameras[index], scan.sizes[index])
-        start = known.get(index, guess)
-        if start is not None:
-            reader.camera_params = ",".join(
-                map(repr, colmap_camera(start, reader.camera_model).params.tolist())
-            )
-        paths = [image.path for image in scan.images if image.camera == index]
-        # Imported in order first: extraction numbers images as its threads finish them.
-        with _colmap_errors():
-            pycolmap.import_images(database, scan.root, pycolmap.CameraMode.SINGLE, paths, reader)
+        paths = _paths(scan, index)
+        reader = _reader(scan, lenses, known, index)
         reader.existing_camera_id = _read_image(database, paths[0]).camera_id
         for begin in range(0, len(paths), IMAGES_A_BATCH):
             batch = paths[begin : begin + IMAGES_A_BATCH]
-            with _colmap_errors():
+            with colmap_errors():
                 pycolmap.extract_features(
                     database, scan.root, batch, pycolmap.CameraMode.SINGLE, reader, options,
                     pycolmap.Device.cpu,
                 )  # fmt: skip
             progress("extracting features", done := done + len(batch), len(scan.images))
+
+
+def import_images(
+    scan: Scan, lenses: Sequence[LensName], known: dict[int, Camera], database: Path
+) -> None:
+    """A database of the scan's cameras and images without features; `known` as above."""
+    with pycolmap.Database.open(database):
+        pass  # importing images wants it to exist
+    for index in range(len(scan.cameras)):
+        reader = _reader(scan, lenses, known, index)
+        with colmap_errors():
+            pycolmap.import_images(
+                database, scan.root, pycolmap.CameraMode.SINGLE, _paths(scan, index), reader
+            )
+
+
+def _paths(scan: Scan, index: int) -> list[str]:
+    return [image.path for image in scan.images if image.camera == index]
+
+
+def _reader(
+    scan: Scan, lenses: Sequence[LensName], known: dict[int, Camera], index: int
+) -> pycolmap.ImageReaderOptions:
+    """How COLMAP reads the images of one camera, and where its lens starts."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = MAPPING_MODEL[lenses[index]]
+    reader.default_focal_length_factor = DEFAULT_FOCAL
+    guess = fisheye_guess(reader.camera_model, scan.cameras[index], scan.sizes[index])
+    start = known.get(index, guess)
+    if start is not None:
+        reader.camera_params = ",".join(
+            map(repr, colmap_camera(start, reader.camera_model).params.tolist())
+        )
+    return reader
+
+
+@contextmanager
+def keypoint_writer(database: Path) -> Iterator[Callable[[str, FloatArray], None]]:
+    """For features found elsewhere: tells a database the pixels (n, 2) of those of one image."""
+    with pycolmap.Database.open(database) as db:
+        numbers = {image.name: image.image_id for image in db.read_all_images()}
+        yield lambda path, pixels: db.write_keypoints(
+            numbers[path], (pixels + PIXEL_OFFSET).astype(np.float32)
+        )
 
 
 def write_features(
@@ -180,51 +211,6 @@ def open_descriptors(scan: Scan, database: Path) -> Iterator[Callable[[int], NDA
             return np.asarray(db.read_descriptors(key).data)[largest]
 
         yield read
-
-
-def match_features(
-    scan: Scan, pairs: Sequence[Pair], database: Path, seed: int, progress: Progress
-) -> None:
-    """Match the given pairs and keep what one epipolar geometry explains."""
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed  # else threads share one stream of random numbers
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listing = database.with_name("pairs.txt")
-    # COLMAP cuts the lines of its list at blanks, which paths may hold and numbers do not.
-    numbers = {image.path: str(index) for index, image in enumerate(scan.images)}
-    _rename_images(database, numbers)
-    for begin in range(0, len(pairs), PAIRS_A_BATCH):
-        batch = pairs[begin : begin + PAIRS_A_BATCH]
-        listing.write_text("".join(f"{a} {b}\n" for a, b in batch))
-        with _colmap_errors():
-            pycolmap.match_image_pairs(
-                database, options, pairing, verification, pycolmap.Device.cpu
-            )
-        progress("matching", begin + len(batch), len(pairs))
-    _rename_images(database, {number: path for path, number in numbers.items()})
-
-
-def _rename_images(database: Path, names: dict[str, str]) -> None:
-    with pycolmap.Database.open(database) as db:
-        for image in db.read_all_images():
-            image.name = names[image.name]
-            db.update_image(image)
-
-
-def match_counts(scan: Scan, database: Path) -> dict[Pair, int]:
-    """Verified matches of each pair of images."""
-    number = {image.path: index for index, image in enumerate(scan.images)}
-    with pycolmap.Database.open(database) as db:
-        names = {image.image_id: image.name for image in db.read_all_images()}
-        pair_ids, counts = db.read_two_view_geometry_num_inliers()
-    counted: dict[Pair, int] = {}
-    for pair_id, count in zip(pair_ids, counts, strict=True):
-        ids = pair_id if isinstance(pair_id, tuple) else pycolmap.pair_id_to_image_pair(pair_id)
-        a, b = sorted(number[names[image_id]] for image_id in ids)
-        counted[a, b] = int(count)
-    return counted
 
 
 def constrain_rig(
@@ -328,7 +314,7 @@ def map_images(
         registered = min(registered + 1, len(scan.images))
         progress("mapping", registered, len(scan.images))
 
-    with _colmap_errors():
+    with colmap_errors():
         models = pycolmap.incremental_mapping(
             database, scan.root, out, options,
             initial_image_pair_callback=count, next_image_callback=count,
@@ -337,16 +323,20 @@ def map_images(
 
 
 def keypoint_scales(database: Path) -> dict[str, FloatArray]:
-    """Sizes (n,) in px of the keypoints of each image, by path: how far their frames reach."""
+    """Sizes (n,) in px of the keypoints of each image, by path: how far their frames reach.
+
+    NaN, for unknown, of those that have no frame.
+    """
     with pycolmap.Database.open(database) as db:
         return {image.name: _scales(db, image.image_id) for image in db.read_all_images()}
 
 
 def _scales(db: pycolmap.Database, image_id: int) -> FloatArray:
-    found = np.asarray(db.read_keypoints(image_id), dtype=np.float64)
-    if found.shape[1] < 6:  # places alone
-        return np.ones(len(found))
-    return np.abs(np.linalg.det(found[:, 2:6].reshape(-1, 2, 2))) ** 0.5
+    keypoints = np.asarray(db.read_keypoints(image_id), dtype=np.float64)
+    if keypoints.shape[1] < 6:
+        return np.full(len(keypoints), np.nan)
+    result: FloatArray = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2))) ** 0.5
+    return result
 
 
 def free_model(

@@ -21,7 +21,7 @@ from graphs.frames import Transform
 from graphs.lenses import LensName
 from graphs.problem import Problem, images_seen
 from graphs.refine import refine
-from sfm_calib import colmap, features
+from sfm_calib import colmap, colmap_matches, features
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
@@ -145,16 +145,16 @@ def _map_coarsely(
     database = place / DATABASE
     colmap.write_features(scan, lenses, known, found, database)
     pairs = first_pairs(scan, _overlapping(scan, known, nominal))
-    colmap.match_features(scan, pairs, database, config.seed, progress)
-    counts = colmap.match_counts(scan, database)
+    colmap_matches.match_features(scan, pairs, database, config.seed, progress)
+    counts = colmap_matches.match_counts(scan, database)
     if not in_sequence(scan, counts):
         database.unlink()
         colmap.write_features(scan, lenses, known, found, database)
         pairs = choose_pairs(
             scan, config.pairs, lambda i: found[i].descriptors, config.seed, progress
         )
-        colmap.match_features(scan, pairs, database, config.seed, progress)
-        counts = colmap.match_counts(scan, database)
+        colmap_matches.match_features(scan, pairs, database, config.seed, progress)
+        counts = colmap_matches.match_counts(scan, database)
     check_overlap(scan, counts)
     whole = len(nominal) == len(scan.cameras)
     rig = tuple(nominal[i] for i in range(len(nominal))) if whole else None

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from graphs.camera import Camera
 from graphs.frames import FloatArray, Transform
@@ -13,11 +17,14 @@ from graphs.join import join_models
 from graphs.lenses import LensName
 from graphs.problem import Problem, images_seen
 from graphs.rig_start import FreeModel, impose_rig, link_cameras
-from sfm_calib import colmap
+from sfm_calib import colmap, colmap_matches
 from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan
+from sfm_calib.learned import extract as learned_features
+from sfm_calib.learned import matching as learned_matches
+from sfm_calib.learned.choice import Learned, choose
 from sfm_calib.mapping_attempts import attempts
 from sfm_calib.nominal import nominal_rig
 from sfm_calib.pairs import Pair, choose_pairs
@@ -50,21 +57,26 @@ def map_scan(
 
     Raises CalibrationError when images do not overlap, or a camera cannot be placed.
     """
-    hashes = scan.hashes
+    learned = choose(config)
+    hashes, who = scan.hashes, learned.name if learned else "COLMAP"
     inputs: list[object] = [
         hashes, scan.cameras, lenses, config.max_features, config.image_scale,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,
+        *(learned.features_from if learned else []),
     ]  # fmt: skip
     features = cache.stage(
         "features",
         inputs,
-        lambda place: run_apart(_extract, (scan, config, lenses, known, place), progress),
+        lambda place: run_apart(
+            _extract, (scan, config, lenses, known, learned, place), progress, who
+        ),
     )
     inputs += [scan.frames, config.pairs, config.seed]
+    inputs += learned.matches_from if learned else []
     matches = cache.stage(
         "matches",
         inputs,
-        lambda place: run_apart(_match, (scan, config, features, place), progress),
+        lambda place: run_apart(_match, (scan, config, features, learned, place), progress, who),
     )
     database, reference = matches / DATABASE, reference_of(scan, config)
     nominal = nominal_rig(config, scan.cameras, reference)
@@ -83,7 +95,7 @@ def map_scan(
         )
     if len(images_seen(problem.observations)) < len(scan.images):
         messages += _unmatched(scan, matches)
-    return Mapped(problem, messages, hashes)
+    return Mapped(problem, messages, hashes | (learned.hashes if learned else {}))
 
 
 def problem_of(
@@ -115,24 +127,53 @@ def _extract(
     config: RigConfig,
     lenses: Sequence[LensName],
     known: dict[int, Camera],
+    learned: Learned | None,
+    place: Path,
+    progress: Progress,
+) -> None:
+    database, most = place / DATABASE, config.max_features
+    if learned is None:
+        colmap.extract_features(scan, lenses, known, database, most, config.image_scale, progress)
+        return
+    colmap.import_images(scan, lenses, known, database)
+    with colmap.keypoint_writer(database) as write:
+        learned_features.extract(scan, learned, most, place, write, progress)
+
+
+def _match(
+    scan: Scan,
+    config: RigConfig,
+    features: Path,
+    learned: Learned | None,
     place: Path,
     progress: Progress,
 ) -> None:
     database = place / DATABASE
-    colmap.extract_features(
-        scan, lenses, known, database, config.max_features, config.image_scale, progress
-    )
-
-
-def _match(scan: Scan, config: RigConfig, features: Path, place: Path, progress: Progress) -> None:
-    shutil.copytree(features, place, dirs_exist_ok=True)
-    database = place / DATABASE
-    with colmap.open_descriptors(scan, database) as descriptors:
+    left = shutil.ignore_patterns(learned_features.FOLDER)  # large, and read where it is
+    shutil.copytree(features, place, dirs_exist_ok=True, ignore=left)
+    with _descriptors(scan, features, learned, database) as descriptors:
         pairs = choose_pairs(scan, config.pairs, descriptors, config.seed, progress)
     if len(pairs) < len(scan.images) * (len(scan.images) - 1) // 2:
         (place / LIKELY_PAIRS).write_text(str(len(pairs)))
-    colmap.match_features(scan, pairs, database, config.seed, progress)
-    check_overlap(scan, colmap.match_counts(scan, database))
+    if learned is None:
+        colmap_matches.match_features(scan, pairs, database, config.seed, progress)
+    else:
+        with colmap_matches.match_writer(database) as write:
+            learned_matches.match(scan, pairs, learned, features, write, progress)
+        colmap_matches.verify_matches(scan, pairs, database, config.seed, progress)
+    check_overlap(scan, colmap_matches.match_counts(scan, database))
+
+
+@contextmanager
+def _descriptors(
+    scan: Scan, features: Path, learned: Learned | None, database: Path
+) -> Iterator[Callable[[int], NDArray[Any]]]:
+    """A reader of the descriptors (n, d) of one image, the largest or the surest first."""
+    if learned is not None:
+        yield lambda i: learned_features.load(features, i).descriptors
+        return
+    with colmap.open_descriptors(scan, database) as read:
+        yield read
 
 
 def check_overlap(scan: Scan, counts: dict[Pair, int]) -> None:
@@ -195,7 +236,7 @@ def reference_of(scan: Scan, config: RigConfig) -> int:
 
 
 def _overlap_in_words(scan: Scan, database: Path) -> str:
-    counts = colmap.match_counts(scan, database)
+    counts = colmap_matches.match_counts(scan, database)
     matched = sum(count >= MIN_MATCHES for count in counts.values())
     return f"{matched} pairs match, at most {max(counts.values(), default=0)} features each"
 
@@ -216,7 +257,7 @@ def _one_model(
 
 
 def _lost_camera(scan: Scan, model: FreeModel, camera: int, database: Path) -> str:
-    counts = colmap.match_counts(scan, database)
+    counts = colmap_matches.match_counts(scan, database)
     own = {i for i, image in enumerate(scan.images) if image.camera == camera}
     within = [n for (a, b), n in counts.items() if a in own and b in own]
     across = [n for (a, b), n in counts.items() if (a in own) != (b in own)]

@@ -16,6 +16,7 @@ from graphs.problem import Estimate, PriorRig, Problem
 from sfm_calib.config import CameraConfig, RigConfig
 from sfm_calib.errors import CalibrationError, nearest
 from sfm_calib.images import Scan
+from sfm_calib.learned.choice import check_choice
 from sfm_calib.scale import check_scale, with_scale
 
 
@@ -93,6 +94,7 @@ def check_config(config: RigConfig, scan: Scan) -> None:
                 f"rig.yaml holds {parameter} of camera {name} without its value: add "
                 f"cameras.{name}.params.{parameter}"
             )
+    check_choice(config)
     _check_shared_lenses(config, scan)
     check_scale(config.scale, scan)
 

@@ -49,6 +49,7 @@ from sfm_calib.files import calibration_sha256
 from sfm_calib.formats import CameraRig
 from sfm_calib.guided import map_with_prior
 from sfm_calib.images import Progress, Scan
+from sfm_calib.learned.choice import refuse_learned
 from sfm_calib.mapping import Mapped
 from sfm_calib.nominal import check_config, start_from_config
 from sfm_calib.old_calibration import OldCalibration, old_calibration, with_scale_of
@@ -122,6 +123,7 @@ def recalibrate(
     drift: by what the old one is judged. As `calibrate`. Raises CalibrationError also where the
     two have no camera in common.
     """
+    refuse_learned(config, "recalibrate")
     watch = Stopwatch()
     scan = checked_scan(scan_path, config, cache, progress, watch)
 

@@ -27,6 +27,7 @@ from sfm_calib.provenance import Provenance
 from sfm_calib.run import Run
 from sfm_calib.scale import in_words
 from sfm_calib.scale_ledger import entries_of, ledger_of
+from sfm_calib.torch_import import torch_versions
 from sfm_calib.uncertainty import uncertainty_of
 from sfm_calib.verdict import verdict_of
 
@@ -273,7 +274,8 @@ def _provenance(run: Run) -> Provenance:
     return Provenance(
         version=sfm_calib.__version__,
         versions={"python": platform.python_version()}
-        | {name: version(name) for name in LIBRARIES},
+        | {name: version(name) for name in LIBRARIES}
+        | (torch_versions() if run.config.features != "sift" else {}),
         command=run.command,
         config=run.config.model_dump(mode="json"),
         seed=run.config.seed,

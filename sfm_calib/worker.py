@@ -28,15 +28,13 @@ DISK_FULL = ("disk is full", "No space left on device")
 
 
 def run_apart(
-    work: Callable[..., None],
-    arguments: Sequence[object],
-    progress: Progress,
-    who: str = "COLMAP",
+    work: Callable[..., None], arguments: Sequence[object], progress: Progress, who: str = "COLMAP"
 ) -> None:
     """Call `work(*arguments, progress)` in another process; a function of a module, and values.
 
-    who: does the work, as messages call it. Raises what `work` raises, OSError when it died of a
-    full disk, and BrokenDownError when it died of anything else.
+    who: does the work, as messages begin.
+    Raises what `work` raises, OSError when it died of a full disk, and BrokenDownError when it
+    died of anything else.
     """
     reading, writing = os.pipe()
     job = (work, tuple(arguments), colmap.is_verbose())

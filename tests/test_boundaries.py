@@ -49,14 +49,14 @@ def test_the_product_does_not_know_the_studies(path: Path) -> None:
     assert "experiments" not in top(imported(path))
 
 
-def test_one_module_of_the_product_knows_colmap() -> None:
+def test_two_modules_of_the_product_know_colmap() -> None:
     knows = {
         str(path.relative_to(ROOT))
         for package in ("graphs", "sfm_calib")
         for path in sources(package)
         if "pycolmap" in top(imported(path))
     }
-    assert knows == {"sfm_calib/colmap.py"}
+    assert knows == {"sfm_calib/colmap.py", "sfm_calib/colmap_matches.py"}
 
 
 @pytest.mark.parametrize("package", [*PACKAGES, "tests"])

@@ -13,7 +13,7 @@ from synthetic.scans import simulation
 from graphs.camera import project, unproject
 from graphs.frames import Transform
 from graphs.lenses import LENS_NAMES, PARAMETER_NAMES
-from sfm_calib import colmap
+from sfm_calib import colmap, colmap_matches
 from sfm_calib.cache import Cache
 from sfm_calib.colmap_lenses import EXACT_MODEL, LENS_OF_MODEL, MAPPING_MODEL
 from sfm_calib.images import Scan, ScanImage, read_scan
@@ -31,7 +31,7 @@ def mapped(scan, place):
     colmap.extract_features(scan, ["radtan"] * 2, {}, database, 250, 1.0, quiet)
     n = len(scan.images)
     pairs = [(a, b) for a in range(n) for b in range(a + 1, n)]
-    colmap.match_features(scan, pairs, database, 0, quiet)
+    colmap_matches.match_features(scan, pairs, database, 0, quiet)
     with sqlite3.connect(database) as db:
         tables = ("images", "cameras", "keypoints", "descriptors", "two_view_geometries")
         content = {t: db.execute(f"select * from {t} order by 1").fetchall() for t in tables}

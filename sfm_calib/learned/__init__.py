@@ -1,0 +1,1 @@
+"""Features and matches by networks: kornia's, with weights from elsewhere."""

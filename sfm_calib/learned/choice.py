@@ -1,0 +1,77 @@
+"""Which features are tracked and how they are matched; of torch and kornia nothing is imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm_calib.config import RigConfig
+from sfm_calib.errors import CalibrationError
+from sfm_calib.files import sha256
+from sfm_calib.learned.weights import FeatureName, find_features, find_matcher
+from sfm_calib.torch_import import Device, check_torch, torch_versions
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Learned features: their network, its weights, and what matches them."""
+
+    name: FeatureName
+    weights: Path
+    lightglue: Path | None  # its weights; None: the nearest descriptors match
+    device: Device
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the weights, by their files' names."""
+        files = (self.weights, self.lightglue)
+        return {file.name: sha256(file) for file in files if file is not None}
+
+    @property
+    def features_from(self) -> list[object]:
+        """All that makes the features besides the images, for the cache."""
+        return [self.name, sha256(self.weights), self.device, torch_versions()]
+
+    @property
+    def matches_from(self) -> list[object]:
+        """All that makes their matches besides, for the cache."""
+        return [sha256(self.lightglue) if self.lightglue else "nearest"]
+
+
+def check_choice(config: RigConfig) -> None:
+    """Raises CalibrationError for features and matchers that do not go together."""
+    if config.features != "sift":
+        check_torch(f"features {config.features}")
+    elif config.matcher == "lightglue":
+        raise CalibrationError(
+            "matcher lightglue is for learned features, and features is sift: add --features "
+            "aliked (or xfeat, disk), or leave the matcher out"
+        )
+    elif config.weights is not None:
+        raise CalibrationError(
+            f"weights {config.weights} is given, and features is sift, which needs none: add "
+            "--features aliked (or xfeat, disk), or leave the weights out"
+        )
+
+
+def refuse_learned(config: RigConfig, command: str) -> None:
+    """Raises CalibrationError for learned features: `command` knows SIFT's alone."""
+    if config.features != "sift":
+        raise CalibrationError(
+            f"{command} tracks SIFT features alone, and features is {config.features}: say "
+            "--features sift, or run calibrate and compare the two"
+        )
+
+
+def choose(config: RigConfig) -> Learned | None:
+    """What a configuration asks for, with its weights; None: SIFT.
+
+    Raises CalibrationError as `check_choice`, and where weights are nowhere.
+    """
+    check_choice(config)
+    if config.features == "sift":
+        return None
+    name = config.features
+    weights = find_features(name, config.weights)
+    glue = find_matcher(name, config.weights) if config.matcher == "lightglue" else None
+    return Learned(name, weights, glue, config.device)
