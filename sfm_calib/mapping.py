@@ -137,7 +137,7 @@ def _extract(
         return
     colmap.import_images(scan, lenses, known, database)
     with colmap.keypoint_writer(database) as write:
-        learned_features.extract(scan, learned, most, place, write, progress)
+        learned_features.extract(scan, learned, most, config.image_scale, place, write, progress)
 
 
 def _match(

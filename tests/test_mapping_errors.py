@@ -78,10 +78,10 @@ def test_it_is_said_where_likely_pairs_alone_were_matched(tmp_path, monkeypatch)
     for folder in folders:
         folder.mkdir()
     config = RigConfig(max_features=200)
-    mapping._extract(scan, config, ["radtan"], {}, folders[0], silent)
+    mapping._extract(scan, config, ["radtan"], {}, None, folders[0], silent)
     for folder in folders[1:]:
         chosen = config.model_copy(update={"pairs": folder.name})
-        mapping._match(scan, chosen, folders[0], folder, silent)
+        mapping._match(scan, chosen, folders[0], None, folder, silent)
     (said,) = mapping._unmatched(scan, folders[1])
     n_pairs = int(said.split()[0])
     assert 5 <= n_pairs < 15 and "of 15 pairs" in said and "--pairs all" in said

@@ -43,20 +43,21 @@ def extract(
     scan: Scan,
     learned: Learned,
     max_features: int,
+    image_scale: float,
     place: Path,
     write: Callable[[str, FloatArray], None],
     progress: Progress,
 ) -> None:
-    """Find the features of every image, one at a time, and keep them in `place`.
+    """Find the features of every image, at this share of its size, and keep them in `place`.
 
     `write(path, pixels)` is told where they are in each. Raises CalibrationError where weights or
     device are not there, or an image cannot be read.
     """
     detector = build_detector(learned.name, learned.weights, learned.device)
-    longest = LONGEST_SIDE_PX[learned.name]
     (place / FOLDER).mkdir()
     for index, image in enumerate(scan.images):
         rgb = read_rgb(scan.root / image.path)
+        longest = round(image_scale * min(LONGEST_SIDE_PX[learned.name], max(rgb.shape)))
         found = features_of(rgb, detector, longest, learned.device, max_features)
         save(found, place, index)
         write(image.path, found.pixels)
