@@ -22,7 +22,7 @@ def random_weights(name, place, seed=0):
 
 
 def random_lightglue(name, place):
-    """A file with weights of LightGlue, named as XFeat's authors name them, or DISK's, or kornia."""
+    """A file with weights of LightGlue, named as in the published file of XFeat, or of DISK."""
     torch, features = import_or_skip()
     torch.manual_seed(0)
     shape = {k: v for k, v in features.LightGlue.features[name].items() if k != "weights"}
