@@ -52,7 +52,6 @@ class Refined:
     problem: Problem
     n_before: int
     moved_px: float  # median
-    rounds: int
 
     @property
     def message(self) -> str:
@@ -93,7 +92,7 @@ def refine_tracks(
         state = _solved(state, graph_options, options)
     moved = np.linalg.norm(state.pixels - rough.observations.pixels, axis=1)[state.good]
     final = compact(state.now, state.measured().subset(state.good))
-    return Refined(final, len(state.good), float(np.median(moved)), number)
+    return Refined(final, len(state.good), float(np.median(moved)))
 
 
 @dataclass(frozen=True)
