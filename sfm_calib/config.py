@@ -73,13 +73,12 @@ class Options(SolveOptions):
     pairs: Literal["auto", "all", "selected"] = "auto"
     """Image pairs to match; auto: all of a small scan, likely neighbours of a large one."""
     features: Literal["sift", "xfeat", "aliked", "disk"] = "sift"
-    """What is tracked: SIFT, or what a network finds (extra `learned`, and weights)."""
+    """What is tracked: SIFT, or features of a network (needs sfm_calib[learned], and weights)."""
     matcher: Literal["auto", "nearest", "lightglue"] = "auto"
-    """How features are matched: with the nearest in the other image, or by LightGlue; auto: the
-    nearest."""
+    """How learned features are matched: each with the nearest of the other image, or by LightGlue,
+    which takes ten times as long; auto: the nearest."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Weights of the networks, a file or a folder; default: those of an installed package, or
-    fetched."""
+    """Weights of the networks, a file or a folder; default: of an installed package, or fetched."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where networks run."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
