@@ -74,13 +74,12 @@ class Options(SolveOptions):
     """Image pairs to match; selected: neighbours in time and on the rig, and images that look
     alike; auto: all while matching them takes about three minutes, else selected."""
     features: Literal["sift", "xfeat", "aliked", "disk"] = "sift"
-    """What is tracked: SIFT, or what a network finds (extra `learned`, and weights)."""
+    """What is tracked: SIFT, or features of a network (needs sfm_calib[learned], and weights)."""
     matcher: Literal["auto", "nearest", "lightglue"] = "auto"
-    """How features are matched: with the nearest in the other image, or by LightGlue; auto: the
-    nearest."""
+    """How learned features are matched: each with the nearest of the other image, or by LightGlue,
+    which takes ten times as long; auto: the nearest."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Weights of the networks, a file or a folder; default: those of an installed package, or
-    fetched."""
+    """Weights of the networks, a file or a folder; default: of an installed package, or fetched."""
     max_features: Annotated[int, Field(ge=100, le=50000)] = 8192
     """Features an image, at most: 100 to 50000."""
     image_scale: Annotated[float, Field(ge=0.1, le=1)] = 1.0

@@ -58,7 +58,7 @@ def map_scan(
     Raises CalibrationError when images do not overlap, or a camera cannot be placed.
     """
     learned = choose(config)
-    hashes, who = scan.hashes, learned.name if learned else "COLMAP"
+    hashes, who = scan.hashes, learned.network if learned else "COLMAP"
     inputs: list[object] = [
         hashes, scan.cameras, lenses, config.max_features, config.image_scale,
         {i: camera.params.tolist() for i, camera in known.items()}, colmap.VERSION,

@@ -8,7 +8,7 @@ from pathlib import Path
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
-from sfm_calib.learned.weights import FeatureName, find_features, find_matcher
+from sfm_calib.learned.weights import FEATURES, FeatureName, find_features, find_matcher
 from sfm_calib.torch_import import Device, check_torch, torch_versions
 
 
@@ -20,6 +20,11 @@ class Learned:
     weights: Path
     lightglue: Path | None  # its weights; None: the nearest descriptors match
     device: Device
+
+    @property
+    def network(self) -> str:
+        """Its name in words."""
+        return FEATURES[self.name].network
 
     @property
     def hashes(self) -> dict[str, str]:

@@ -20,7 +20,9 @@ from sfm_calib.learned.weights import FeatureName
 from sfm_calib.torch_import import Device, import_torch
 
 FOLDER = "learned"  # beside the database: COLMAP's own descriptors are bytes
-# Larger images are shrunk: peak memory of ALIKED and DISK is 1.9 and 2.4 kB a pixel.
+# Larger images are shrunk. Of six photographs of fountain (3072 px wide) noise is 0.32 px with
+# 1024 px and 0.23 px with 1600 px (ALIKED), 0.40 and 0.26 px (DISK); SIFT's at full size 0.20 px.
+# 1600 px take 17, 17 and 4 s of one core an image (ALIKED, DISK, XFeat) and 3.3, 4.2 and 0.7 GB.
 LONGEST_SIDE_PX: dict[FeatureName, int] = {"xfeat": 1600, "aliked": 1600, "disk": 1600}
 
 

@@ -182,9 +182,11 @@ def detect(detector: Detector, image: Any, most: int) -> tuple[Any, Any]:
     beyond = (0, -width % STRIDE, 0, -height % STRIDE)  # at the right and below: nothing moves
     with torch.inference_mode():
         padded = torch.nn.functional.pad(image[None], beyond, mode="replicate")
+        # The turned image first: its descriptors, a GB, are gone when the upright ones come.
+        turned = detector.maps(padded.flip(2, 3)).peaks if detector.both_ways else None
         maps = detector.maps(padded)
-        if detector.both_ways:
-            maps = _both_ways(detector, padded, maps)
+        if turned is not None:
+            maps = _both_ways(detector, maps, turned.flip(0, 1))
         whole = _maxima(maps.peaks, detector.threshold)
         whole = whole[(whole[:, 0] < width) & (whole[:, 1] < height)]
         x, y = whole.T
@@ -195,9 +197,8 @@ def detect(detector: Detector, image: Any, most: int) -> tuple[Any, Any]:
         return pixels - pixels.new_tensor(detector.lean_px), maps.describe(pixels)
 
 
-def _both_ways(detector: Detector, image: Any, upright: Maps) -> Maps:
-    """The maps with peaks that are the mean of both: of the image, and of it upside down."""
-    turned = detector.maps(image.flip(2, 3)).peaks.flip(0, 1)
+def _both_ways(detector: Detector, upright: Maps, turned: Any) -> Maps:
+    """Maps with peaks that are the mean of both: the upright image's, and the turned one's."""
     mean = (upright.peaks + turned) / 2
     before, after = (len(_maxima(peaks, detector.threshold)) for peaks in (upright.peaks, mean))
     if before >= FEWEST_TO_JUDGE and after < LEFT_OF_TURNED * before:
