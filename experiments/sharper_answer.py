@@ -136,7 +136,7 @@ def too_few(cases: Sequence[Case]) -> Iterator[str]:
     elif cases[0].rendered:
         fewest = min(len(case.rows(kind)) for case in cases for kind in (RAW, *refined))
         if fewest < FEWEST_SEEDS:
-            yield f"{named(cases)}: {fewest} seeds, and {FEWEST_SEEDS} are needed"
+            yield f"{named(cases)}: {fewest} seed{'s' * (fewest != 1)} of {FEWEST_SEEDS} needed"
 
 
 # ---- requirements --------------------------------------------------------------------------
@@ -215,7 +215,8 @@ def sentences(cases: Sequence[Case], judged: Sequence[Finding]) -> Iterator[str]
         for kind in dict.fromkeys(one.kind for one in own):
             said = ", ".join(one.in_words for one in own if one.kind == kind)
             yield f"{named(some)}: {kind.name}: {said}"
-            yield from lost(some, kind)
+            if any(one.kind == kind and one.what != TIME for one in own):
+                yield from lost(some, kind)
 
 
 def lost(cases: Sequence[Case], kind: Kind) -> Iterator[str]:

@@ -21,9 +21,12 @@ from experiments.sharper_kinds import (
     gain,
     kinds_of,
     mean_square_of,
+    names_of,
     root_mean,
     square_of,
+    values_of,
 )
+from experiments.standard_errors import rms
 from sfm_calib.report.theme import camera_colour, plain, styled
 
 ROTATION = ("rotation_x", "rotation_y", "rotation_z", "rotation_deg")
@@ -91,31 +94,25 @@ def kind_table(cases: Sequence[Case]) -> AnswerTable:
 
 
 def parameter_table(cases: Sequence[Case]) -> AnswerTable:
-    """A row a parameter of every camera, scan and kind of tracks."""
-    found = []
+    """A row a kind of parameter, of all cameras, for each scan and kind of tracks."""
+    found: list[tuple[str | float, ...]] = []
     for case in cases:
         for kind in kinds_of([case]):
-            some = [row for row in case.rows(kind) if row.get("names")]
-            names = dict.fromkeys(str(n) for row in some for n in row["names"])  # type: ignore[union-attr]
-            found += [(case.name, kind.name, name, *_of_parameter(some, name)) for name in names]
-    columns = ("scan", "tracks", "parameter", "trials", "error", "sigma", "noise alone", "z rms")
-    title = "Errors against the truth or a reference, and what is stated of them, rms over seeds"
+            rows = case.rows(kind)
+            names = dict.fromkeys(name for row in rows for name in names_of(row))
+            for name in dict.fromkeys(one.rpartition(".")[2] for one in names):
+                error, sigma, alone, reference = (
+                    np.concatenate([values_of(row, column, (name,)) for row in rows])
+                    for column in ("error", "sigma", "sigma_noise", "sigma_reference")
+                )
+                z = error / np.maximum(np.hypot(sigma, reference), 1e-300)
+                values = (rms(one) for one in (error, sigma, alone, z))
+                found.append((case.name, kind.name, name, len(error), *values))
+    columns = ("scan", "tracks", "parameter", "values", "error", "sigma", "noise alone", "z rms")
+    title = (
+        "Errors against truth or reference, and what is stated of them, rms over cameras and seeds"
+    )
     return AnswerTable("parameters", title, columns, tuple(found))
-
-
-def _of_parameter(rows: Sequence[Row], name: str) -> tuple[float | int, ...]:
-    """Trials, and rms of error, sigma, sigma of noise alone and error over sigma."""
-    values = []
-    for row in rows:
-        names: list[str] = list(row["names"])  # type: ignore[arg-type]
-        if name in names:
-            at = names.index(name)
-            lists = ("error", "sigma", "sigma_noise", "sigma_reference")
-            values.append([row[column][at] for column in lists])  # type: ignore[index]
-    error, sigma, alone, reference = np.array(values, dtype=np.float64).T
-    z = error / np.maximum(np.hypot(sigma, reference), 1e-300)
-    rms = [float(np.sqrt(np.mean(np.square(one)))) for one in (error, sigma, alone, z)]
-    return len(values), *rms
 
 
 def seconds_table(cases: Sequence[Case]) -> AnswerTable:

@@ -170,10 +170,16 @@ def mean_square_of(column: str, parameters: Sequence[str]) -> Measure:
 
 def values_of(row: Row, column: str, parameters: Sequence[str]) -> FloatArray:
     """Of a list of the row, those of all cameras' parameters of these names (n,)."""
-    names: Any = row.get("names") or ()
     values: Any = row.get(column) or ()
-    some = [v for n, v in zip(names, values, strict=True) if n.rpartition(".")[2] in parameters]
+    both = zip(names_of(row), values, strict=True)
+    some = [value for name, value in both if name.rpartition(".")[2] in parameters]
     return np.array(some, dtype=np.float64)
+
+
+def names_of(row: Row) -> tuple[str, ...]:
+    """The parameters that were compared with a truth or a reference."""
+    names: Any = row.get("names") or ()
+    return tuple(names)
 
 
 def root_mean(rows: Sequence[Row], measure: Measure) -> float | None:

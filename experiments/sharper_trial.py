@@ -25,7 +25,7 @@ from graphs.frames import angle_between
 from graphs.jackknife import blocks_of, change
 from graphs.lenses import PARAMETER_NAMES
 from graphs.model_covariance import model_covariance
-from graphs.problem import BoolArray
+from graphs.problem import BoolArray, IntArray
 from graphs.split_check import difference_px
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import Outcome
@@ -178,25 +178,34 @@ def seconds(calibration: Calibration, made: Mapping[str, float | None]) -> Row:
 def halves(
     outcome: Outcome, options: SharperOptions, config: RigConfig, seed: int
 ) -> Iterator[tuple[str, Cell]]:
-    """How far halves of the frames project apart, each calibrated alone: mean over drawn halves."""
+    """How far halves of the frames project apart, each calibrated alone: median over drawn halves.
+
+    A half that determines little may lie anywhere, and would make a mean of few its own.
+    """
     found, rng = outcome.refinement, np.random.default_rng([seed, DRAWN_HALVES])
     angle = options.said.get("min_parallax_deg", config.min_parallax_deg)
     model = model_covariance(found.graph, found.estimate, found.values)
     block = blocks_of(found.problem)
-    drawn = [second_half(block, rng) for _ in range(options.halves)]
+    drawn = second_halves(block, options.halves, rng)
     apart = [difference_px(found.graph, found.estimate, model, one, angle) for one in drawn]
     told = [one for one in apart if one is not None]
-    yield "halves_px", float(np.mean(told)) if told else None
+    yield "halves_px", float(np.median(told)) if told else None
     yield "n_halves", len(told)
 
 
-def second_half(block: np.ndarray, rng: np.random.Generator) -> BoolArray:
-    """Frames (n_frames,) of the second half: of every two blocks in a row one, by lot."""
+def second_halves(block: IntArray, most: int, rng: np.random.Generator) -> list[BoolArray]:
+    """Frames (n_frames,) of the second half, in several ways: of every two blocks in a row one.
+
+    By lot, no way twice; fewer than `most` where there are no more.
+    """
     n_blocks = int(block.max()) + 1
-    coins = rng.integers(0, 2, (n_blocks + 1) // 2)
-    is_second = (np.arange(n_blocks) + np.repeat(coins, 2)[:n_blocks]) % 2 == 1
-    result: BoolArray = is_second[block]
-    return result
+    n_pairs = (n_blocks + 1) // 2
+    found = []
+    for number in rng.permutation(2 ** (n_pairs - 1))[:most] if n_blocks > 1 else ():
+        coins = number >> np.arange(n_pairs) & 1
+        is_second = (np.arange(n_blocks) + np.repeat(coins, 2)[:n_blocks]) % 2 == 1
+        found.append(is_second[block])
+    return found
 
 
 # ---- errors --------------------------------------------------------------------------------

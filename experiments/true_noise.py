@@ -12,9 +12,17 @@ import numpy as np
 from graphs.build import GraphOptions, build
 from graphs.clusters import euclidean, homogeneous
 from graphs.frames import FloatArray, Transform
-from graphs.noise import RAYLEIGH_MEDIAN, left_by_point
-from graphs.problem import Estimate, Observations, Problem, residuals_px, whitened
-from graphs.refine import noise_of
+from graphs.losses import LossName
+from graphs.noise import RAYLEIGH_MEDIAN, left_by_point, residual_lengths
+from graphs.problem import (
+    BoolArray,
+    Estimate,
+    Observations,
+    Problem,
+    residuals_px,
+    whitened,
+)
+from graphs.refine import noise_of, residuals
 from graphs.selection import compact
 from graphs.threads import threads
 from graphs.track_building import nearest_points, rays_of
@@ -23,6 +31,7 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.formats import CameraRig
 
 QUANTILE = 0.9
+FAR = 4.0  # sigmas: of Gaussian errors 3 in 10,000 are longer
 
 
 @dataclass(frozen=True)
@@ -37,43 +46,60 @@ class Noise:
 def true_noise(problem: Problem, truth: Estimate) -> Noise:
     """The noise of a problem's observations, from the truth of its cameras and frames.
 
-    Each point is where its own observations put it, seen by the true cameras, with Cauchy's loss:
-    what it takes of them for its three numbers is given back. `truth` holds no points.
-    Raises ValueError where nothing can be projected.
+    Each point is where its own observations put it, seen by the true cameras; what it takes of
+    them for its three numbers is given back. `truth` holds no points. Mismatches, far off a robust
+    fit, take no part in placing points and are counted with the rest; points with less than two
+    others are left out. Raises ValueError where nothing can be projected.
     """
-    placed = triangulated(problem, truth)
-    return noise_about(placed.initial, placed.observations)
+    robust = triangulated(begun(problem, truth), "cauchy")
+    far = noise_about(robust.initial, robust.observations).weighed_px * FAR
+    with np.errstate(invalid="ignore"):
+        good = residual_lengths(robust, residuals(robust)) < far
+    often = np.bincount(robust.observations.point[good], minlength=len(robust.initial.points))
+    kept = often[robust.observations.point] > 1
+    robust = compact(robust, robust.observations.subset(kept))
+    good = good[kept]
+    fitted = triangulated(compact(robust, robust.observations.subset(good)), "none")
+    everywhere = replace(fitted.initial, rig_from_world=robust.initial.rig_from_world)
+    return noise_about(everywhere, robust.observations, good)
 
 
-def triangulated(problem: Problem, truth: Estimate) -> Problem:
-    """The problem with the true cameras and frames, and its points where these see them.
+def begun(problem: Problem, truth: Estimate) -> Problem:
+    """The problem with the true cameras and frames, and points nearest to where these look.
 
     Observations that a true camera cannot have made are left out, with points that lose all but
     one of theirs.
     """
-    centres, rays = rays_of(truth, problem.observations)
-    seen = np.isfinite(rays).all(axis=1)
-    often = np.bincount(problem.observations.point[seen], minlength=len(problem.initial.points))
-    seen &= often[problem.observations.point] > 1
-    points = np.zeros_like(problem.initial.points)
-    found = nearest_points(centres[seen], rays[seen], problem.observations.point[seen])
-    points[: len(found)] = found
-    start = replace(problem, initial=replace(truth, points=points))
-    start = compact(start, problem.observations.subset(seen))
-    graph = build(start, GraphOptions(noise_of(start)))
-    with threads() as pool:
-        begin = homogeneous(graph.tracks, start.initial.points)
-        ended, _ = triangulate(graph.tracks, graph.variables(graph.initial), begin, pool)
-    points = euclidean(graph.tracks, ended, start.initial.points)
+    seen = problem.observations
+    centres, rays = rays_of(truth, seen)
+    known = np.isfinite(rays).all(axis=1)
+    known &= np.bincount(seen.point[known], minlength=len(problem.initial.points))[seen.point] > 1
+    blank = replace(truth, points=np.zeros_like(problem.initial.points))
+    start = compact(replace(problem, initial=blank), seen.subset(known))
+    points = nearest_points(centres[known], rays[known], start.observations.point)
     return replace(start, initial=replace(start.initial, points=points))
 
 
-def noise_about(estimate: Estimate, seen: Observations) -> Noise:
-    """The noise of observations about an estimate of which only the points were fitted to them."""
+def triangulated(problem: Problem, loss: LossName) -> Problem:
+    """The problem with its points where its cameras and frames see them, these held as they are."""
+    graph = build(problem, GraphOptions(noise_of(problem), loss))
+    with threads() as pool:
+        start = homogeneous(graph.tracks, problem.initial.points)
+        ended, _ = triangulate(graph.tracks, graph.variables(graph.initial), start, pool)
+    points = euclidean(graph.tracks, ended, problem.initial.points)
+    return replace(problem, initial=replace(problem.initial, points=points))
+
+
+def noise_about(estimate: Estimate, seen: Observations, fitted: BoolArray | None = None) -> Noise:
+    """The noise of observations about an estimate of which only the points were fitted to them.
+
+    fitted (n_obs,): to which; all, where it is not given.
+    """
     errors = residuals_px(estimate, seen)
     weight = np.ones(len(seen)) if seen.relative_sigma is None else seen.relative_sigma**-2.0
-    of_track = np.bincount(seen.point, weight).astype(np.float64)
-    left = left_by_point(weight, of_track[seen.point])
+    used = weight if fitted is None else np.where(fitted, weight, 0.0)
+    of_track = np.bincount(seen.point, used).astype(np.float64)[seen.point]
+    left = left_by_point(used, of_track)
     lengths = _lengths(errors, left)
     weighed = _lengths(whitened(errors, seen.whitening), left)
     if not lengths.size:
@@ -123,5 +149,7 @@ def true_frames(path: Path) -> dict[str, Transform]:
             name: Transform.from_wxyz(one["rotation_wxyz"], one["translation"])
             for name, one in record.items()
         }
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CalibrationError(f"cannot read the true frames from {path}: {error}") from error
+    except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"cannot read the true frames from {path}: {error}; simulate again"
+        ) from error
