@@ -116,7 +116,9 @@ class CalibrationOptions(TrialOptions):
     @property
     def said(self) -> dict[str, Any]:
         """Every option of a command, a simulation or a change that is said, by its key here."""
-        own = CalibrationOptions.model_fields
+        base = type(self).__base__  # holds what is of trials themselves
+        assert base is not None and issubclass(base, CalibrationOptions)
+        own = base.model_fields
         return {
             key: value
             for key in type(self).model_fields
@@ -192,7 +194,8 @@ def optional(model: type, prefix: str = "") -> dict[str, Any]:
     return {f"{prefix}{name}": (hints[name] | None, None) for name in names_of(model)}
 
 
-def _fields() -> dict[str, Any]:
+def of_commands() -> dict[str, Any]:
+    """Every option of a command, a simulation or a change, as a field that may be left out."""
     # TargetOptions after Options: it takes every `frames` that they do, and one more.
     commands = (Options, TargetOptions, RecalibrateOptions, DriftOptions)
     found = {key: field for model in commands for key, field in optional(model).items()}
@@ -204,6 +207,6 @@ def _fields() -> dict[str, Any]:
 
 
 CalibrationTrial: type[CalibrationOptions] = create_model(
-    "CalibrationTrial", __base__=CalibrationOptions, __module__=__name__, **_fields()
+    "CalibrationTrial", __base__=CalibrationOptions, __module__=__name__, **of_commands()
 )
 CalibrationTrial.__doc__ = CalibrationOptions.__doc__

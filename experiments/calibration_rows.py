@@ -11,6 +11,7 @@ from experiments.runner.protocol import TIMING, Cell, Row
 from graphs.frames import log_rotation
 from graphs.lenses import PARAMETER_NAMES
 from sfm_calib.compare import CompareOptions, compare
+from sfm_calib.compare_record import Comparison
 from sfm_calib.drift_record import DriftRecord, DriftTest
 from sfm_calib.drift_verdict import change_text
 from sfm_calib.formats import CameraRig
@@ -122,7 +123,11 @@ def truth_columns(calibration: CameraRig, truth: CameraRig) -> Row:
     over all images and ranges, a change of frames taken out; `expected_px` by the sigmas.
     Raises CalibrationError where they are not of the same cameras.
     """
-    record = compare(truth, calibration, CompareOptions()).record
+    return columns_of(compare(truth, calibration, CompareOptions()).record)
+
+
+def columns_of(record: Comparison) -> Row:
+    """The same of a comparison with the truth as A."""
     row: dict[str, Cell] = {f"{p.name}{Z}": p.z for p in record.parameters if p.z is not None}
     chance = record.chance
     if chance is None:

@@ -15,7 +15,7 @@ from graphs.frames import FloatArray
 from graphs.image_grid import image_grid, typical_distances
 from graphs.jackknife import blocks_of, solve_part
 from graphs.model_covariance import ModelCovariance
-from graphs.problem import Estimate
+from graphs.problem import BoolArray, Estimate
 from graphs.stated_covariance import CalibrationCovariance, factors
 
 DRAWS, SEED = 20_000, 0  # of the distribution of what is expected
@@ -52,16 +52,11 @@ def split_check(
     if not covariance.basis.names:
         return None
     model, second = covariance.basis, blocks_of(graph.problem) % 2 == 1
-    halves = [
-        solve_part(graph, estimate, model, frames, min_parallax_deg) for frames in (~second, second)
-    ]
-    if halves[0] is None or halves[1] is None:
+    halves = _solved(graph, estimate, model, second, min_parallax_deg)
+    if halves is None:
         return None
-    in_unit = estimate.scaled(1 / model.unit)
-    distances = typical_distances(in_unit, graph.problem.observations)
-    grid = image_grid(in_unit, model.names, distances.tolist()).settled
-    apart = grid @ (halves[0][0] - halves[1][0])
-    squared = float((apart**2).sum(-1).mean())
+    grid = _grid(graph, estimate, model)
+    squared = _squared_px(grid, halves)
     widening = _widening(model.matrix, covariance.stated.matrix)
     of_halves = _of_difference(halves[0][1], halves[1][1])
     by_all = grid.reshape(-1, len(model.names)) / len(grid) ** 0.5
@@ -77,6 +72,50 @@ def split_check(
         float(np.trace(by_all @ of_halves @ by_all.T)) ** 0.5,
         float((np.count_nonzero(draws >= squared) + 1) / (DRAWS + 1)),
     )
+
+
+def difference_px(
+    graph: CalibrationGraph,
+    estimate: Estimate,
+    model: ModelCovariance,
+    second: BoolArray,
+    min_parallax_deg: float,
+) -> float | None:
+    """How far any two halves project apart, rms over all images; second (n_frames,): the second's.
+
+    None as of `split_check`.
+    """
+    if not model.names:
+        return None
+    halves = _solved(graph, estimate, model, second, min_parallax_deg)
+    return halves and _squared_px(_grid(graph, estimate, model), halves) ** 0.5
+
+
+Half = tuple[FloatArray, ModelCovariance]  # as `solve_part` gives it
+
+
+def _solved(
+    graph: CalibrationGraph,
+    estimate: Estimate,
+    model: ModelCovariance,
+    second: BoolArray,
+    min_parallax_deg: float,
+) -> tuple[Half, Half] | None:
+    halves = [
+        solve_part(graph, estimate, model, frames, min_parallax_deg) for frames in (~second, second)
+    ]
+    return None if halves[0] is None or halves[1] is None else (halves[0], halves[1])
+
+
+def _grid(graph: CalibrationGraph, estimate: Estimate, model: ModelCovariance) -> FloatArray:
+    """How pixels over all images move with the parameters (n_pixels, 2, n)."""
+    in_unit = estimate.scaled(1 / model.unit)
+    distances = typical_distances(in_unit, graph.problem.observations)
+    return image_grid(in_unit, model.names, distances.tolist()).settled
+
+
+def _squared_px(grid: FloatArray, halves: tuple[Half, Half]) -> float:
+    return float(((grid @ (halves[0][0] - halves[1][0])) ** 2).sum(-1).mean())
 
 
 def _of_difference(a: ModelCovariance, b: ModelCovariance) -> FloatArray:

@@ -112,7 +112,7 @@ def consistent_tracks(
     `seen.point` are tracks, which may show several points and one image several times; the
     estimate's own points are not looked at. Of a point, an image keeps the best observation.
     """
-    centres, rays = _rays(estimate, seen)
+    centres, rays = rays_of(estimate, seen)
     order = np.lexsort((np.arange(len(seen)), seen.point))
     order = order[np.isfinite(rays[order, 0])]
     begins = np.searchsorted(seen.point[order], np.arange(seen.point.max(initial=-1) + 2))
@@ -156,7 +156,7 @@ def _best_of_each_image(seen: Observations, errors: FloatArray) -> BoolArray:
         return best & (errors < GATE_PX)
 
 
-def _rays(estimate: Estimate, seen: Observations) -> tuple[FloatArray, FloatArray]:
+def rays_of(estimate: Estimate, seen: Observations) -> tuple[FloatArray, FloatArray]:
     """Centres and unit directions (n_obs, 3) in the world; NaN where the lens sees nothing."""
     centres, rays = np.empty((len(seen), 3)), np.empty((len(seen), 3))
     for index, camera in enumerate(estimate.cameras):

@@ -14,7 +14,7 @@ from graphs.model_covariance import model_covariance
 from graphs.priors import PINNED_SIGMA, LensPrior
 from graphs.problem import KnownBaseline, Problem
 from graphs.solve import solve
-from graphs.split_check import TOO_LITTLE_PX, SplitCheck, _widening, split_check
+from graphs.split_check import TOO_LITTLE_PX, SplitCheck, _widening, difference_px, split_check
 from graphs.stated_covariance import CalibrationCovariance, calibration_covariance
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
@@ -51,6 +51,21 @@ def test_halves_of_independent_noise_agree_as_often_as_they_should() -> None:
     assert p[0] < 0.35 and p[-1] > 0.65 and 0.3 < p.mean() < 0.7
     assert sum(c.agrees for c in found) >= 19
     assert all(c.model_px == pytest.approx(c.expected_px, rel=0.05) for c in found)
+
+
+def test_any_halves_can_be_held_against_each_other() -> None:
+    """Every second block gives the check's own difference, other halves others."""
+    problem = problem_of()
+    graph = build(problem, GraphOptions(SIGMA_PX))
+    estimate, values, _ = solve(graph)
+    model, block = model_covariance(graph, estimate, values), blocks_of(problem)
+    of_check = checked(problem)
+    assert of_check is not None
+    found = difference_px(graph, estimate, model, block % 2 == 1, 1.0)
+    assert found == pytest.approx(of_check.difference_px, rel=1e-9)
+    other = difference_px(graph, estimate, model, block < 5, 1.0)
+    assert other is not None and other > 0 and other != pytest.approx(found, rel=0.01)
+    assert difference_px(graph, estimate, model, block < 0, 1.0) is None
 
 
 def test_a_focal_length_that_changes_is_told() -> None:
