@@ -167,8 +167,7 @@ def seconds(calibration: Calibration, made: Mapping[str, float | None]) -> Row:
     }
     patches = watched.get("matching patches")
     if patches is not None:
-        rounds = [value for name, value in made.items() if name.startswith("patches")]
-        row["seconds_patches"] = None if None in rounds else patches
+        row["seconds_patches"] = None if made.get("patches") is None else patches
     return row
 
 

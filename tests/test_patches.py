@@ -17,9 +17,9 @@ from graphs.problem import BoolArray, residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.patches import match
 from sfm_calib.patches.crops import Images, cut_out
-from sfm_calib.patches.match import Matches, Sights, load_matches, match_patches
+from sfm_calib.patches.match import Matches, Sights, match_patches
+from sfm_calib.patches.rounds import is_good
 from sfm_calib.patches.warps import HALF, monomials, steps_px, warps_of
-from sfm_calib.refine import is_good
 
 pytest.importorskip("torch", reason="torch is an extra: pip install 'sfm_calib[learned]'")
 pytest.importorskip("kornia", reason="kornia is an extra: pip install 'sfm_calib[learned]'")
@@ -36,9 +36,8 @@ def matched(one: Scene, folder: Path, images: list[np.ndarray] | None = None) ->
         paths.append(folder / f"{index}.png")
         cv2.imwrite(str(paths[-1]), image)
     seen = one.problem.observations
-    sights = Sights(one.true.initial, seen, seen.pixels, seen.frame, paths)
-    match_patches(sights, "cpu", 2, folder, silent)
-    return load_matches(folder)
+    sights = Sights(one.true.initial, seen, seen.pixels, seen.frame, Images(paths))
+    return match_patches(sights, "cpu", silent)
 
 
 def errors(one: Scene, found: Matches, good: BoolArray | None = None) -> FloatArray:

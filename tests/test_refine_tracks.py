@@ -25,7 +25,9 @@ from sfm_calib.cli import main
 from sfm_calib.config import Options
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Scan, ScanImage
-from sfm_calib.refine import Refined, _medians, _State, _to_be_matched, refine_tracks
+from sfm_calib.patches.rounds import State, medians, to_be_matched
+from sfm_calib.patches.warps import warps_of
+from sfm_calib.refine import Refined, refine_tracks
 
 needs_torch = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("torch", "kornia")),
@@ -122,36 +124,36 @@ def test_images_of_something_else_are_refused(tmp_path: Path) -> None:
 def test_tracks_that_look_different_now_are_matched_again() -> None:
     one = drawn()
     state = replace(
-        _State.before(one.true),
-        linear=sfm_calib.refine.warps_of(
+        State.before(one.true),
+        linear=warps_of(
             one.true.initial, one.true.observations, one.true.observations.pixels
         ).linear,
     )
     seen = one.true.observations
-    assert len(_to_be_matched(state, 0)) == len(seen)
-    assert not len(_to_be_matched(state, 1))
+    assert len(to_be_matched(state, 0)) == len(seen)
+    assert not len(to_be_matched(state, 1))
     points = one.true.initial.points.copy()
     points[5] *= 0.8  # a fifth nearer: seen from other sides
     moved = replace(one.true, initial=replace(one.true.initial, points=points))
-    again = _to_be_matched(replace(state, now=moved), 2)
+    again = to_be_matched(replace(state, now=moved), 2)
     np.testing.assert_array_equal(again, np.flatnonzero(seen.point == 5))
     lost = np.flatnonzero(seen.point == 9)[0]
     good = np.arange(len(seen)) != lost
-    again = _to_be_matched(replace(state, good=good), 1)
+    again = to_be_matched(replace(state, good=good), 1)
     np.testing.assert_array_equal(again, np.flatnonzero(seen.point == 9))
-    assert not len(_to_be_matched(replace(state, good=good), 2))  # once is enough
+    assert not len(to_be_matched(replace(state, good=good), 2))  # once is enough
 
 
 def test_a_median_is_that_of_its_label() -> None:
     rng = np.random.default_rng(0)
     values, label = rng.standard_normal(101), rng.integers(0, 9, 101)
     expected = [np.quantile(values[label == k], 0.5, method="lower") for k in label]
-    np.testing.assert_allclose(_medians(values, label), expected)
+    np.testing.assert_allclose(medians(values, label), expected)
 
 
 def test_measured_pixels_are_those_of_the_match() -> None:
     one = drawn()
-    state = _State.before(one.true)
+    state = State.before(one.true)
     n = len(state.good)
     cov_px = np.broadcast_to(np.array([[4e-4, 1e-4], [1e-4, 9e-4]]), (n, 2, 2))
     good = np.arange(n) % 5 != 0

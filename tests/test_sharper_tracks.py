@@ -141,11 +141,11 @@ def test_a_stage_has_seconds_where_it_was_made_alone(tmp_path: Path) -> None:
         assert (cache.stage(name, [1], make) / "file").read_text() == "made"
     assert first.seconds["features"] is not None and second.seconds["features"] is None
     stages = {"matching patches": 3.0, "solving": 1.0, "covariance": 0.5, "tracks and mapping": 9.0}
-    row = seconds(solved(stages), second.seconds | {"patches0": 2.0})
+    row = seconds(solved(stages), second.seconds | {"patches": 2.0})
     assert row["seconds_features"] is None and row["seconds_matches"] is None
     assert row["seconds_mapping"] == second.seconds["models"]
     assert (row["seconds_patches"], row["seconds_solve"]) == (3.0, 1.5)
-    again = seconds(solved(stages), {"patches0": None, "patches1": 2.0})
+    again = seconds(solved(stages), {"patches": None})
     assert again["seconds_patches"] is None
     assert "seconds_patches" not in seconds(solved({"solving": 1.0}), {})
 

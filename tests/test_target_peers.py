@@ -103,7 +103,7 @@ def test_a_camera_alone_has_the_sigmas_of_gauss_newton(views: BoardViews) -> Non
 
 def test_a_pair_of_held_lenses_keeps_those_of_each_alone(views: BoardViews) -> None:
     found = calibrate_pair(views, CORNERS, "radtan", refined=False)
-    for index, camera in enumerate(found.cameras):
+    for index in range(len(found.cameras)):
         alone = calibrate_camera(of_camera(views, index), CORNERS, "radtan")
         for name, sigma in alone.covariance.sigma.items():
             # OpenCV solves twice, and on some machines ends at another last digit.

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from graphs.frames import FloatArray
 from graphs.problem import Estimate, IntArray, Observations
+from graphs.threads import thread_count
 from sfm_calib.images import Progress
 from sfm_calib.patches.alignment import Aligned, align
 from sfm_calib.patches.crops import Images, cut_out, has_place
 from sfm_calib.patches.warps import warps_of
 from sfm_calib.torch_import import Device, import_torch
 
-FILE = "patches.npz"
-# Observations at once. Each takes 40 kB: on a CPU 120 MB a thread, on a GPU a gigabyte.
-A_BATCH = {"cpu": 3000, "cuda": 25_000}
+# Observations at once. Each takes 40 kB: on a CPU 40 MB a thread, on a GPU a gigabyte.
+A_BATCH = {"cpu": 1000, "cuda": 25_000}
 GPU_THREADS = 2  # one cuts out what the other does not yet match
 
 
@@ -31,7 +30,7 @@ class Sights:
     seen: Observations
     middle: FloatArray  # (n_obs, 2) px, where each patch starts
     image: IntArray  # (n_obs,) number of each observation's image
-    paths: Sequence[Path]  # of the images, by number
+    images: Images  # by number
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,8 @@ class Matches:
     linear: FloatArray  # (n_obs, 2, 2) px a sample, before matching
 
 
-def match_patches(
-    sights: Sights, device: Device, n_threads: int, place: Path, progress: Progress
-) -> None:
-    """Match all patches and keep what was found in a folder, as `load_matches` reads it.
+def match_patches(sights: Sights, device: Device, progress: Progress) -> Matches:
+    """Match all patches.
 
     Raises CalibrationError where an image or the device cannot be had.
     """
@@ -59,30 +56,24 @@ def match_patches(
     sizes = np.array([camera.size for camera in sights.estimate.cameras])[seen.camera]
     shown = has_place(warps, sizes)
     shown &= shown[warps.reference]  # without its square nothing is known of a track
-    images, done = Images(sights.paths), 0
+    done = 0
 
     def matched(rows: IntArray) -> tuple[IntArray, Aligned]:
         part = warps.subset(rows)
-        crops = cut_out(images, sights.image[rows], part)
+        crops = cut_out(sights.images, sights.image[rows], part)
         is_reference = part.reference == np.arange(len(rows))
         return rows, align(torch, crops, seen.point[rows], is_reference, device)
 
     batches = _batches(seen.point, sights.image, np.flatnonzero(shown), A_BATCH[device])
     # One thread a batch: torch's own wait for each other after every sum, and spin.
     torch.set_num_threads(1)
-    with ThreadPoolExecutor(n_threads if device == "cpu" else GPU_THREADS) as pool:
+    with ThreadPoolExecutor(thread_count() if device == "cpu" else GPU_THREADS) as pool:
         for rows, aligned in pool.map(matched, batches):
             found.pixels[rows] += aligned.pixels
             found.cov_px[rows] = aligned.cov_px
             found.likeness[rows] = aligned.likeness
             progress("matching patches", done := done + len(rows), int(shown.sum()))
-    np.savez(place / FILE, **vars(found))
-
-
-def load_matches(place: Path) -> Matches:
-    """The matches that `match_patches` kept."""
-    with np.load(place / FILE) as file:
-        return Matches(*(file[name] for name in Matches.__dataclass_fields__))
+    return found
 
 
 def _batches(point: IntArray, image: IntArray, rows: IntArray, size: int) -> Iterator[IntArray]:
