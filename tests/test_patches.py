@@ -16,7 +16,7 @@ from graphs.noise import RAYLEIGH_MEDIAN
 from graphs.problem import BoolArray, residuals_px
 from sfm_calib.errors import CalibrationError
 from sfm_calib.patches import match
-from sfm_calib.patches.crops import Images, cut_out
+from sfm_calib.patches.crops import MARGIN, Images, cut_out
 from sfm_calib.patches.match import Matches, Sights, match_patches
 from sfm_calib.patches.rounds import is_good
 from sfm_calib.patches.warps import HALF, monomials, steps_px, warps_of
@@ -222,10 +222,10 @@ def test_images_beyond_the_memory_are_read_again(tmp_path: Path) -> None:
     paths = [tmp_path / f"{i}.png" for i in range(4)]
     for index, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((64, 64), 40 * index, np.uint8))
-    images = Images(paths, most_bytes=12_000)  # two pyramids of 64 x 64
+    images = Images(paths, most_bytes=60_000)  # two pyramids of 64 x 64
     for number in (0, 1, 2, 3, 0, 3, 1):
-        assert images.pyramid(number)[0][5, 5] == 40 * number
-        assert images.bytes_kept <= 12_000
+        assert images.pyramid(number)[0][MARGIN, MARGIN] == 40 * number
+        assert images.bytes_kept <= 60_000
     paths[2].write_bytes(b"")
     with pytest.raises(CalibrationError, match=r"2\.png can no longer be read"):
         images.pyramid(2)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
@@ -24,6 +25,7 @@ from sfm_calib.patches.warps import Warps
 
 LEVELS = 5  # halvings at most: keypoints of 48 px scale fill whole images
 SIDE = 44  # px of a crop: 15 samples up to 1.4 px apart, foreshortened, and room to move
+MARGIN = SIDE // 2
 MOST_BYTES = 2_000_000_000  # of images in memory
 
 
@@ -38,7 +40,7 @@ class Images:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def pyramid(self, number: int) -> list[NDArray[np.uint8]]:
-        """An image, and its halvings down to a size that still holds something.
+        """An image, and its halvings down to a size that still holds something, in black margins.
 
         Raises CalibrationError where it cannot be read.
         """
@@ -55,6 +57,8 @@ class Images:
         levels = [image]
         while len(levels) <= LEVELS and min(levels[-1].shape) > 2:
             levels.append(cv2.pyrDown(levels[-1]))
+        around = (MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_CONSTANT)
+        levels = [np.asarray(cv2.copyMakeBorder(level, *around), np.uint8) for level in levels]
         self._kept[number] = levels
         self.bytes_kept += sum(level.nbytes for level in levels)
         while self.bytes_kept > self.most_bytes and len(self._kept) > 1:
@@ -75,20 +79,20 @@ class Crops:
 
 
 def cut_out(images: Images, number: IntArray, warps: Warps) -> Crops:
-    """The crops of observations, of the images by number (n,)."""
+    """The crops of observations in their images, of the images by number (n,)."""
     step = np.sqrt(np.abs(np.linalg.det(warps.linear)))
     level = np.clip(np.round(np.log2(np.maximum(step, 1e-3))), 0, LEVELS).astype(np.int64)
     pixels = np.zeros((len(number), SIDE, SIDE), np.uint8)
     corner, size = np.zeros((len(number), 2), np.int64), np.zeros((len(number), 2), np.int64)
     for image in np.unique(number):
         levels = images.pyramid(int(image))
-        for row in np.flatnonzero(number == image):
-            level[row] = min(level[row], len(levels) - 1)
-            whole = levels[level[row]]
-            middle = warps.middle[row] / 2.0 ** level[row]
-            corner[row] = np.round(middle).astype(np.int64) - SIDE // 2
-            size[row] = whole.shape[1], whole.shape[0]
-            _copy(whole, corner[row], pixels[row])
+        level[number == image] = np.minimum(level[number == image], len(levels) - 1)
+        for used in np.unique(level[number == image]):
+            rows = np.flatnonzero((number == image) & (level == used))
+            corner[rows] = np.round(warps.middle[rows] / 2.0**used).astype(np.int64) - MARGIN
+            size[rows] = np.array(levels[used].shape[::-1]) - 2 * MARGIN
+            column, line = corner[rows].T + MARGIN
+            pixels[rows] = sliding_window_view(levels[used], (SIDE, SIDE))[line, column]
     px = 2.0**level
     edges = np.stack([np.maximum(-corner, 0), np.minimum(size - 1 - corner, SIDE - 1)], axis=1)
     return Crops(
@@ -98,16 +102,6 @@ def cut_out(images: Images, number: IntArray, warps: Warps) -> Crops:
         warps.coefficients / px[:, None, None],
         px,
     )
-
-
-def _copy(image: NDArray[np.uint8], corner: IntArray, crop: NDArray[np.uint8]) -> None:
-    """What the image has of a crop that begins at a corner; the rest stays as it is."""
-    first = np.maximum(corner, 0)
-    last = np.minimum(corner + SIDE, [image.shape[1], image.shape[0]])
-    if (last <= first).any():
-        return
-    (x0, y0), (x1, y1) = first - corner, last - corner
-    crop[y0:y1, x0:x1] = image[first[1] : last[1], first[0] : last[0]]
 
 
 def has_place(warps: Warps, sizes: IntArray) -> BoolArray:
