@@ -8,7 +8,9 @@ have a truth: the noise is that of the observations about their points, triangul
 cameras in their true places, robustly. Real ones (configs/sharper_tracks_real.yaml) have
 references, and halves of the frames that are calibrated apart, drawn by the seed. Ratios are
 raw SIFT's rms over the other's, a geometric mean over scans; standard errors leave out one trial
-after the other. Each stage is timed where a trial did it, and not where it found it done.
+after the other, and nothing is decided where they reach over what is required. Other seeds of a
+real scan draw other halves and map it anew, and have none. Each stage is
+timed where a trial did it, and not where it found it done.
 Expectation: refined SIFT on rendered scans has a true noise at least 2.5 times smaller, errors of
 focal length and principal point at least 2 times smaller, and NEES of 0.8 to 1.3. On real scans
 sigma_px and the difference of halves are at least 1.5 times smaller, and differences from the

@@ -49,7 +49,8 @@ def joined_at_spots(problem: Problem) -> Problem:
 
     A blob with two orientations is two features of SIFT's, a fifth of all are such, and their
     tracks say the same twice. Where joining would give a track two pixels of one image it stays
-    apart; the longer track's point is taken.
+    apart; the longer track's point is taken. Points are numbered anew: a problem whose boards or
+    measured spans name points is not for this.
     """
     seen, points = problem.observations, problem.initial.points
     image = seen.camera * len(problem.frame_names) + seen.frame

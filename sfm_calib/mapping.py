@@ -152,7 +152,10 @@ def _match(
     left = shutil.ignore_patterns(learned_features.FOLDER)  # large, and read where it is
     shutil.copytree(features, place, dirs_exist_ok=True, ignore=left)
     with _descriptors(scan, features, learned, database) as descriptors:
-        pairs = choose_pairs(scan, config.pairs, descriptors, config.seed, progress)
+        pairs = choose_pairs(
+            scan, config.pairs, descriptors, config.seed, progress,
+            learned.times_sift if learned else 1.0,
+        )  # fmt: skip
     if len(pairs) < len(scan.images) * (len(scan.images) - 1) // 2:
         (place / LIKELY_PAIRS).write_text(str(len(pairs)))
     if learned is None:

@@ -45,14 +45,18 @@ def choose_pairs(
     descriptors: Descriptors,
     seed: int,
     progress: Progress,
+    times_sift: float = 1.0,
 ) -> list[Pair]:
-    """Sorted pairs of image indices. `descriptors(i)` reads the features (n, d) of image i."""
+    """Sorted pairs of image indices. `descriptors(i)` reads the features (n, d) of image i.
+
+    times_sift: how many times as long as SIFT's a pair takes to be matched.
+    """
     n = len(scan.images)
     every = n * (n - 1) // 2
     if how != "all":
         vocabulary = draw_vocabulary(n, descriptors, seed)
         seconds = SECONDS_A_PAIR + SECONDS_A_FEATURE * vocabulary.mean_features
-        if how == "selected" or every * seconds > MAX_SECONDS:
+        if how == "selected" or every * seconds * times_sift > MAX_SECONDS:
             return likely_pairs(scan, signatures(n, descriptors, vocabulary, progress))
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 

@@ -21,7 +21,7 @@ from graphs.track_building import joined_at_spots
 from sfm_calib.cache import Cache
 from sfm_calib.config import Options
 from sfm_calib.images import Progress, Scan
-from sfm_calib.patches.rounds import Job, load_state, match_in_rounds
+from sfm_calib.patches.rounds import VERSION, Job, load_state, match_in_rounds
 from sfm_calib.torch_import import check_torch, torch_versions
 from sfm_calib.worker import run_apart
 
@@ -72,7 +72,7 @@ def refine_tracks(
     made_of = hashlib.sha256(pickle.dumps(replace(job, paths=()))).hexdigest()
     place = cache.stage(
         STAGE,
-        [made_of, scan.hashes, torch_versions()],
+        [VERSION, made_of, scan.hashes, torch_versions()],
         lambda to: run_apart(match_in_rounds, (job, thread_count(), to), progress, WHO),
     )
     state = load_state(rough, place)

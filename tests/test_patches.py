@@ -36,7 +36,8 @@ def matched(one: Scene, folder: Path, images: list[np.ndarray] | None = None) ->
         paths.append(folder / f"{index}.png")
         cv2.imwrite(str(paths[-1]), image)
     seen = one.problem.observations
-    sights = Sights(one.true.initial, seen, seen.pixels, seen.frame, Images(paths))
+    unknown = np.full_like(one.true.initial.points, np.nan)
+    sights = Sights(one.true.initial, seen, seen.pixels, unknown, seen.frame, Images(paths))
     return match_patches(sights, "cpu", silent)
 
 
@@ -159,7 +160,7 @@ def test_stripes_are_uncertain_along_themselves(tmp_path: Path) -> None:
     flat = walls.waves * np.array([1.0, 0.15, 0.15])
     one = scene(walls=replace(walls, waves=flat), noise=2.0, n_points=60)
     found = matched(one, tmp_path)
-    on_back = np.linalg.norm(found.linear - np.eye(2), axis=(1, 2)) < 0.6
+    on_back = np.linalg.norm(found.fitted - np.eye(2), axis=(1, 2)) < 0.6
     size, directions = np.linalg.eigh(found.cov_px[on_back])
     assert np.median(size[:, 1] / size[:, 0]) > 9
     off = errors(one, found)[on_back]

@@ -122,14 +122,11 @@ def test_images_of_something_else_are_refused(tmp_path: Path) -> None:
 
 @needs_torch
 def test_tracks_that_look_different_now_are_matched_again() -> None:
-    one = drawn()
+    one, seen = drawn(), drawn().true.observations
     state = replace(
         State.before(one.true),
-        linear=warps_of(
-            one.true.initial, one.true.observations, one.true.observations.pixels
-        ).linear,
+        bend=warps_of(one.true.initial, seen, seen.pixels).bend,
     )
-    seen = one.true.observations
     assert len(to_be_matched(state, 0)) == len(seen)
     assert not len(to_be_matched(state, 1))
     points = one.true.initial.points.copy()

@@ -11,6 +11,10 @@ from sfm_calib.files import sha256
 from sfm_calib.learned.weights import FEATURES, FeatureName, find_features, find_matcher
 from sfm_calib.torch_import import Device, check_torch, torch_versions
 
+VERSION = 1  # counted up where other features are found or matched: caches ask
+# A pair's time of matching, for the nearest descriptors and for LightGlue, by that of SIFT's.
+TIMES_NEAREST, TIMES_LIGHTGLUE = 3.0, 160.0
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -27,6 +31,11 @@ class Learned:
         return FEATURES[self.name].network
 
     @property
+    def times_sift(self) -> float:
+        """How many times as long as SIFT's a pair of images takes to be matched."""
+        return TIMES_LIGHTGLUE if self.lightglue else TIMES_NEAREST
+
+    @property
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the weights, by their files' names."""
         files = (self.weights, self.lightglue)
@@ -35,7 +44,7 @@ class Learned:
     @property
     def features_from(self) -> list[object]:
         """All that makes the features besides the images, for the cache."""
-        return [self.name, sha256(self.weights), self.device, torch_versions()]
+        return [VERSION, self.name, sha256(self.weights), self.device, torch_versions()]
 
     @property
     def matches_from(self) -> list[object]:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
 from graphs.problem import BoolArray, IntArray
-from sfm_calib.patches.crops import SIDE, Crops
+from sfm_calib.patches.crops import LEVELS, SIDE, Crops
+from sfm_calib.patches.sensor_noise import A_PIXEL, HALFWAY, shared_noise
 from sfm_calib.patches.warps import HALF
 
 if TYPE_CHECKING:
@@ -38,12 +39,6 @@ ODD = 6.0**0.5
 AFFINE_PRIOR = 0.25  # sigma: surfaces slope, but what shears a patch into a line is an edge's slide
 LEAST_CONTRAST = 0.5  # grey levels: sensor noise alone has more
 WIDTH = 2 * HALF + 1
-# A cubic spline through pixels, halfway between two: what the four pixels on either side add
-# (Unser, Aldroubi and Eden, IEEE Transactions on Signal Processing 41, 1993).
-POLE = 3**0.5 - 2
-SPLINE = 3**0.5 * POLE ** np.abs(np.arange(-5, 7))
-HALFWAY = np.convolve(SPLINE, [1 / 48, 23 / 48, 23 / 48, 1 / 48])[3:11]
-HALFWAY /= HALFWAY.sum()
 
 
 @dataclass(frozen=True)
@@ -52,6 +47,7 @@ class Aligned:
 
     pixels: FloatArray  # (n, 2) from the middles, in image pixels
     cov_px: FloatArray  # (n, 2, 2) of each by itself, from its image's noise
+    linear: FloatArray  # (n, 2, 2) affine change of the reference's samples
     likeness: FloatArray  # (n,) correlation with the mean of the other views
 
 
@@ -161,27 +157,60 @@ class _Batch:
         columns = [by_x, by_y, by_x * x, by_x * y, by_y * x, by_y * y]
         return self.torch.stack([*columns, self.torch.ones_like(inner), inner], -1)
 
-    def normal(self, rows: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Normal equations (n, 8, 8), (n, 8) of rows, and their mean squared residuals (n,)."""
-        torch = self.torch
+    def fit(self, rows: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Design (n, k, 8) of rows, residuals and weights (n, k), mean squared residuals (n,)."""
         track = self.track[rows]
         inner = self.within(mean)[track]
         residual = self.within(self.values[rows]) - inner
         weight = self.window * self.within(self.seen[rows])
         square = (residual**2 * weight).sum(1) / weight.sum(1).clamp(min=1e-6)
         weight = weight / (1 + residual**2 / (ODD**2 * square[:, None] + 1e-12))
-        J = self.design(mean)[track]
-        weighted = J * weight[..., None]
-        H = weighted.mT @ J
-        g = (weighted.mT @ residual[..., None])[..., 0]
         used = (residual**2 * weight).sum(1) / weight.sum(1).clamp(min=1e-6)
-        held = used.clamp(min=1e-3) / (AFFINE_PRIOR * HALF) ** 2
-        affine = torch.arange(2, 6, device=H.device)
-        H[:, affine, affine] += held[:, None]
-        change = self.linear[rows] - torch.eye(2, device=H.device)
-        g[:, 2:6] += held[:, None] * HALF * change.reshape(-1, 4)
-        H.diagonal(dim1=1, dim2=2).add_(1e-6)
-        return H, g, used
+        return self.design(mean)[track], residual, weight, used
+
+    def normal(self, rows: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal equations (n, 8, 8), (n, 8) of rows."""
+        J, residual, weight, square = self.fit(rows, mean)
+        weighted = J * weight[..., None]
+        H, held = weighted.mT @ J, self.held(square)
+        g = (weighted.mT @ residual[..., None])[..., 0]
+        H.diagonal(dim1=1, dim2=2).add_(held + 1e-6)
+        change = self.linear[rows] - self.torch.eye(2, device=H.device)
+        g[:, 2:6] += held[:, 2:6] * HALF * change.reshape(-1, 4)
+        return H, g
+
+    def held(self, square: Tensor) -> Tensor:
+        """What is believed beforehand (n, 8), in units of the mean squared residuals (n,)."""
+        affine = self.torch.tensor([0.0, 0, 1, 1, 1, 1, 0, 0], device=square.device)
+        return affine * square[:, None].clamp(min=1e-3) / (AFFINE_PRIOR * HALF) ** 2
+
+    def cov_shift(self, rows: Tensor, mean: Tensor, px: Tensor) -> Tensor:
+        """Covariance (n, 2, 2) of shifts in samples, of the noise of each image; px (n,) of crops.
+
+        How each sample moves its patch, times what noise every two of them share.
+        """
+        torch = self.torch
+        J, _, weight, square = self.fit(rows, mean)
+        H = ((J * weight[..., None]).mT @ J).double()
+        H.diagonal(dim1=1, dim2=2).add_(self.held(square) + 1e-6)
+        moves = torch.linalg.inv(H)[:, :2].float()  # (n, 2, 8)
+        each = (moves @ J.mT * weight[:, None]).view(-1, 2, WIDTH, WIDTH)
+        spacing = (self.warp[rows, :, 1:3] @ self.linear[rows]).norm(dim=1)  # (n, 2) crop px
+        alike = self.alike(spacing, px.log2().round().long())
+        spread = alike[:, 1, None] @ each @ alike[:, 0, None]
+        from_noise = each.flatten(2) @ spread.flatten(2).mT
+        believed = moves * self.held(square)[:, None] @ moves.mT
+        own = square / (1 - self.share()[rows]).clamp(min=0.1)
+        return ((from_noise + believed) * own[:, None, None]).double()
+
+    def alike(self, spacing: Tensor, level: Tensor) -> Tensor:
+        """Correlations (n, 2, WIDTH, WIDTH) of samples' noise along both axes of a patch."""
+        torch = self.torch
+        table = torch.from_numpy(shared_noise(LEVELS + 1)).to(spacing)
+        lag = torch.arange(WIDTH, device=spacing.device)
+        lag = (lag[:, None] - lag).abs() * spacing[..., None, None]
+        index = (lag * A_PIXEL).round().long().clamp(max=table.shape[1] - 1)
+        return table[level[:, None, None, None], index]
 
     def likeness(self, mean: Tensor) -> Tensor:
         """Correlation (n,) of each view with the mean of the others of its track.
@@ -202,12 +231,11 @@ class _Batch:
     def step(self, rows: Tensor, mean: Tensor, first: bool) -> Tensor:
         """Move rows once; how far each moved, in samples."""
         torch = self.torch
-        H, g, _ = self.normal(rows, mean)
-        # A view is a part of the mean that it is drawn to.
-        step = torch.linalg.solve(H, g) / (1 - self.share()[rows]).clamp(min=0.1)[:, None]
+        H, g = self.normal(rows, mean)
+        # All views move at once: to where the mean is now, though each is a part of it.
+        step = torch.linalg.solve(H, g)
         shift = step[:, :2].clamp(-MOST_SHIFT, MOST_SHIFT)
         affine = (step[:, 2:6] / HALF).clamp(-MOST_AFFINE, MOST_AFFINE).view(-1, 2, 2)
-        affine = torch.where(self.reference[rows, None, None], 0.0, affine)
         if first:  # the mean is the seed itself
             shift = torch.where(self.seed[rows, None], 0.0, shift)
         inverse = torch.linalg.inv(torch.eye(2, device=affine.device) + affine)
@@ -231,7 +259,8 @@ class _Batch:
 
     def count_in(self, mean: Tensor) -> None:
         """Let the views that are like the others form the mean; the seed where none are."""
-        like = (self.likeness(mean) > LEAST_LIKE).float()
+        alone = (self.use > 0) & (self.others() == 0)  # nothing yet to be like
+        like = ((self.likeness(mean) > LEAST_LIKE) | alone).float()
         few = self.of_track(like)[self.track] < 2
         self.use = self.torch.where(few, self.seed.float(), like)
 
@@ -287,7 +316,6 @@ def align(
 def _aligned(batch: _Batch, crops: Crops) -> Aligned:
     torch, every = batch.torch, batch.torch.arange(len(batch.track), device=batch.track.device)
     mean = batch.mean()
-    H, _, square = batch.normal(every, mean)
     x, y = batch.shift.double().unbind(1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
     one, nil = torch.ones_like(x), torch.zeros_like(x)
@@ -302,7 +330,10 @@ def _aligned(batch: _Batch, crops: Crops) -> Aligned:
     px = torch.from_numpy(crops.px.astype(np.float64)).to(warp.device)
     pixels = (warp @ terms[..., None])[..., 0] * px[:, None]
     by_shift = warp @ by_sample @ batch.linear.double() * px[:, None, None]
-    noise = square.double() / (1 - batch.share().double()).clamp(min=0.1)
-    of_shift = torch.linalg.inv(H.double())[:, :2, :2] * noise[:, None, None]
-    cov = by_shift @ of_shift @ by_shift.mT
-    return Aligned(pixels.cpu().numpy(), cov.cpu().numpy(), batch.likeness(mean).cpu().numpy())
+    cov = by_shift @ batch.cov_shift(every, mean, px.float()) @ by_shift.mT
+    return Aligned(
+        pixels.cpu().numpy(),
+        cov.cpu().numpy(),
+        batch.linear.double().cpu().numpy(),
+        batch.likeness(mean).cpu().numpy(),
+    )

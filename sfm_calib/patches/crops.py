@@ -40,7 +40,7 @@ class Images:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def pyramid(self, number: int) -> list[NDArray[np.uint8]]:
-        """An image, and its halvings down to a size that still holds something, in black margins.
+        """An image and its halvings, down to a size that still holds something; mirrored margins.
 
         Raises CalibrationError where it cannot be read.
         """
@@ -57,7 +57,7 @@ class Images:
         levels = [image]
         while len(levels) <= LEVELS and min(levels[-1].shape) > 2:
             levels.append(cv2.pyrDown(levels[-1]))
-        around = (MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_CONSTANT)
+        around = (MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REFLECT_101)
         levels = [np.asarray(cv2.copyMakeBorder(level, *around), np.uint8) for level in levels]
         self._kept[number] = levels
         self.bytes_kept += sum(level.nbytes for level in levels)

@@ -29,6 +29,7 @@ class Sights:
     estimate: Estimate
     seen: Observations
     middle: FloatArray  # (n_obs, 2) px, where each patch starts
+    normal: FloatArray  # (n_points, 3) of the surfaces; NaN: not known
     image: IntArray  # (n_obs,) number of each observation's image
     images: Images  # by number
 
@@ -40,7 +41,8 @@ class Matches:
     pixels: FloatArray  # (n_obs, 2)
     cov_px: FloatArray  # (n_obs, 2, 2)
     likeness: FloatArray  # (n_obs,) to the other views of its track; 0 where nothing could be seen
-    linear: FloatArray  # (n_obs, 2, 2) px a sample, before matching
+    bend: FloatArray  # (n_obs, 2, 3) of the warps by which they were matched
+    fitted: FloatArray  # (n_obs, 2, 2) px a sample, as they were matched
 
 
 def match_patches(sights: Sights, device: Device, progress: Progress) -> Matches:
@@ -50,9 +52,11 @@ def match_patches(sights: Sights, device: Device, progress: Progress) -> Matches
     """
     torch = import_torch("--refine", device)
     seen, n = sights.seen, len(sights.seen)
-    warps = warps_of(sights.estimate, seen, sights.middle)
+    warps = warps_of(sights.estimate, seen, sights.middle, sights.normal)
     unknown = np.full((n, 2, 2), np.inf)
-    found = Matches(sights.middle.copy(), unknown, np.zeros(n), warps.linear)
+    found = Matches(
+        sights.middle.copy(), unknown, np.zeros(n), warps.bend, np.full_like(warps.linear, np.nan)
+    )
     sizes = np.array([camera.size for camera in sights.estimate.cameras])[seen.camera]
     shown = has_place(warps, sizes)
     shown &= shown[warps.reference]  # without its square nothing is known of a track
@@ -72,6 +76,7 @@ def match_patches(sights: Sights, device: Device, progress: Progress) -> Matches
             found.pixels[rows] += aligned.pixels
             found.cov_px[rows] = aligned.cov_px
             found.likeness[rows] = aligned.likeness
+            found.fitted[rows] = warps.linear[rows] @ aligned.linear
             progress("matching patches", done := done + len(rows), int(shown.sum()))
     return found
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphs.build import GraphOptions, build
 from graphs.frames import FloatArray
@@ -20,10 +22,12 @@ from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress
 from sfm_calib.patches.crops import Images
 from sfm_calib.patches.match import Matches, Sights, match_patches
-from sfm_calib.patches.warps import warps_of
+from sfm_calib.patches.slopes import normals_of
+from sfm_calib.patches.warps import HALF, warps_of
 from sfm_calib.torch_import import Device
 
 FILE = "patches.npz"
+VERSION = 1  # counted up where something else is found: caches ask
 # What is left out, of rendered scans, errs by half a pixel and more; what is weighed by its own
 # sigma below that does no harm.
 LEAST_LIKENESS = 0.7
@@ -34,7 +38,8 @@ CLEARLY_UNLIKE, MUCH_MORE = 0.1, 15.0
 FLOOR_PX = 0.01  # of the sigma: what interpolating and a surface's shape leave at the least
 LEAST_MATCHED = 0.2  # of the observations: of scans that went well nine in ten are
 MOST_ROUNDS = 3
-WARP_CHANGED = 0.03  # of its size: a patch's edge then lies a fifth of a sample elsewhere
+Values = TypeVar("Values", bound=NDArray[Any])
+BENT = 0.2  # samples at a patch's edge, of what no affine change makes of it
 
 
 @dataclass(frozen=True)
@@ -79,15 +84,21 @@ class State:
     now: Problem  # the rough one, with its keypoints and the latest estimate
     pixels: FloatArray  # (n_obs, 2)
     cov_px: FloatArray  # (n_obs, 2, 2)
-    linear: FloatArray  # (n_obs, 2, 2) px a sample, of the warps by which they were matched
+    bend: FloatArray  # (n_obs, 2, 3) of the warps by which they were matched
+    fitted: FloatArray  # (n_obs, 2, 2) px a sample, as they were matched; NaN: not yet
     good: BoolArray  # (n_obs,) matched
 
     @staticmethod
     def before(rough: Problem) -> State:
         seen = replace(rough.observations, relative_sigma=None)
-        square = np.full((len(seen), 2, 2), np.nan)
+        square, bend = np.full((len(seen), 2, 2), np.nan), np.full((len(seen), 2, 3), np.nan)
         good = np.ones(len(seen), dtype=bool)
-        return State(replace(rough, observations=seen), seen.pixels, square, square, good)
+        return State(replace(rough, observations=seen), seen.pixels, square, bend, square, good)
+
+    def normals(self) -> FloatArray:
+        """Of the surfaces (n_points, 3), as far as patches were matched."""
+        fitted = np.where(self.good[:, None, None], self.fitted, np.nan)
+        return normals_of(self.now.initial, self.now.observations, fitted)
 
     def measured(self) -> Observations:
         """The observations as they are now; those that are not good mean nothing."""
@@ -108,12 +119,9 @@ def to_be_matched(state: State, number: int) -> IntArray:
     if number == 0:
         return np.arange(len(state.good))
     point, n_points = state.now.observations.point, len(state.now.initial.points)
-    after = warps_of(state.now.initial, state.now.observations, state.pixels).linear
-    with np.errstate(invalid="ignore"):
-        known = np.abs(np.linalg.det(state.linear)) > 0
-    change = np.linalg.solve(np.where(known[:, None, None], state.linear, np.eye(2)), after)
-    with np.errstate(invalid="ignore"):
-        odd = state.good & (np.abs(change - np.eye(2)).max((1, 2)) > WARP_CHANGED)
+    after = warps_of(state.now.initial, state.now.observations, state.pixels, state.normals())
+    change = HALF**2 * np.abs(after.bend - state.bend).max((1, 2))
+    odd = state.good & (change > BENT)
     if number == 1:
         odd |= ~state.good
     whole = np.bincount(point, state.good, minlength=n_points) > 1
@@ -130,18 +138,29 @@ def matched(state: State, rows: IntArray, images: Images, job: Job, progress: Pr
     now, seen = state.now, state.now.observations.subset(rows)
     projected = seen.pixels + residuals_px(now.initial, seen)
     middle = np.where(state.good[rows, None], state.pixels[rows], projected)
-    sights = Sights(now.initial, seen, middle, job.image[rows], images)
+    sights = Sights(now.initial, seen, middle, state.normals(), job.image[rows], images)
     found = match_patches(sights, job.device, progress)
-    pixels, cov_px, linear = (one.copy() for one in (state.pixels, state.cov_px, state.linear))
-    good = state.good.copy()
-    pixels[rows], cov_px[rows], linear[rows] = found.pixels, found.cov_px, found.linear
-    good[rows] = is_good(found, seen.point)
+    good = _put(state.good, rows, is_good(found, seen.point))
     if good.mean() < LEAST_MATCHED:
         raise CalibrationError(
             f"only {good.sum():,} of {len(good):,} observations look alike in the images of their "
             f"track (needs {LEAST_MATCHED:.0%}): calibrate without --refine"
         )
-    return State(now, pixels, cov_px, linear, good)
+    return State(
+        now,
+        _put(state.pixels, rows, found.pixels),
+        _put(state.cov_px, rows, found.cov_px),
+        _put(state.bend, rows, found.bend),
+        _put(state.fitted, rows, found.fitted),
+        good,
+    )
+
+
+def _put(values: Values, rows: IntArray, new: Values) -> Values:
+    """Values with those of some rows replaced."""
+    result = values.copy()
+    result[rows] = new
+    return result
 
 
 def is_good(found: Matches, point: IntArray) -> BoolArray:

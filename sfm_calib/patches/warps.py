@@ -1,9 +1,9 @@
 """How the surface around a point looks through every camera that sees it.
 
 Of each track one view is the reference, whose image is sampled in a square. The surface is taken
-for a plane across the mean viewing direction; seen through the lenses, the square is then a curved
-quadrilateral in every other view, to second order in the samples. What the plane's slope makes of
-it is left to the alignment.
+for a plane, as long as nothing is known of it across the mean viewing direction; seen through the
+lenses, the square is then a curved quadrilateral in every other view, to second order in the
+samples. What an affine change makes of it is left to the alignment.
 """
 
 from __future__ import annotations
@@ -40,6 +40,13 @@ class Warps:
         """Pixels a sample (n_obs, 2, 2) in the middle of each patch."""
         return self.coefficients[:, :, 1:3]
 
+    @property
+    def bend(self) -> FloatArray:
+        """What no affine change makes of a patch: samples (n_obs, 2, 3) of x^2, x y, y^2."""
+        linear = self.linear.copy()
+        linear[np.linalg.det(linear) == 0] = np.nan
+        return np.asarray(np.linalg.solve(linear, self.coefficients[:, :, 3:]), np.float64)
+
     def subset(self, rows: IntArray) -> Warps:
         """Those of whole tracks; rows (n,) ascending."""
         place = np.searchsorted(rows, self.reference[rows])
@@ -51,29 +58,46 @@ def monomials(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def warps_of(estimate: Estimate, seen: Observations, middle: FloatArray) -> Warps:
-    """The warps of all observations, about the pixels (n_obs, 2) given as their middles."""
-    rotation, centre = _places(estimate, seen)
-    away = centre - estimate.points[seen.point]
-    towards = away / np.linalg.norm(away, axis=1, keepdims=True)
-    normal = np.zeros_like(estimate.points)
-    np.add.at(normal, seen.point, towards)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    first = _most_central(seen, (towards * normal[seen.point]).sum(1))
+def warps_of(
+    estimate: Estimate, seen: Observations, middle: FloatArray, normal: FloatArray | None = None
+) -> Warps:
+    """The warps of all observations, about the pixels (n_obs, 2) given as their middles.
+
+    normal: of the surface around each point (n_points, 3), NaN where it is not known.
+    """
+    rotation, centre = places(estimate, seen)
+    facing, first = faced(estimate, seen)
     reference = first[seen.point]
+    normal = facing if normal is None else np.where(np.isfinite(normal), normal, facing)
     grid = HALF * np.array([(x, y) for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)])
     used = np.unique(seen.point)
     ground = np.full((len(estimate.points), len(grid), 3), np.nan)
     ground[used] = _ground(estimate, seen, rotation, centre, first[used], normal[used], grid)
     in_camera = np.einsum("nij,nkj->nki", rotation, ground[seen.point] - centre[:, None])
-    pixels = _by_camera(project, estimate, seen.camera, in_camera, 2)
+    pixels = by_camera(project, estimate, seen.camera, in_camera, 2)
     fit = np.linalg.pinv(monomials(*grid.T))
     coefficients = np.einsum("mk,nkc->ncm", fit, pixels - pixels[:, 4:5])
     coefficients[:, :, 0] = 0.0
     return Warps(reference, middle, coefficients)
 
 
-def _places(estimate: Estimate, seen: Observations) -> tuple[FloatArray, FloatArray]:
+def faced(estimate: Estimate, seen: Observations) -> tuple[FloatArray, IntArray]:
+    """Where each point is seen from: the mean direction (n_points, 3), and the observation
+    (n_points,) that is nearest to it; of a point that nothing sees zeros and -1."""
+    _, centre = places(estimate, seen)
+    away = centre - estimate.points[seen.point]
+    towards = away / np.linalg.norm(away, axis=1, keepdims=True)
+    mean = np.zeros_like(estimate.points)
+    np.add.at(mean, seen.point, towards)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+    order = np.lexsort((-(towards * mean[seen.point]).sum(1), seen.point))
+    points, first = np.unique(seen.point[order], return_index=True)
+    nearest = np.full(len(estimate.points), -1)
+    nearest[points] = order[first]
+    return mean, nearest
+
+
+def places(estimate: Estimate, seen: Observations) -> tuple[FloatArray, FloatArray]:
     """Rotation (n_obs, 3, 3) and centre (n_obs, 3) in the world of each observation's camera."""
     rotation = np.empty((len(estimate.cameras), len(estimate.rig_from_world), 3, 3))
     centre = np.empty(rotation.shape[:3])
@@ -83,15 +107,6 @@ def _places(estimate: Estimate, seen: Observations) -> tuple[FloatArray, FloatAr
             rotation[camera, frame] = cam_from_world.rotation
             centre[camera, frame] = cam_from_world.inverse.translation
     return rotation[seen.camera, seen.frame], centre[seen.camera, seen.frame]
-
-
-def _most_central(seen: Observations, along: FloatArray) -> IntArray:
-    """The observation (n_points,) of each point with the largest `along` (n_obs,); -1: none."""
-    order = np.lexsort((-along, seen.point))
-    points, first = np.unique(seen.point[order], return_index=True)
-    result = np.full(int(seen.point.max(initial=-1)) + 1, -1)
-    result[points] = order[first]
-    return result
 
 
 def _ground(
@@ -109,9 +124,9 @@ def _ground(
         estimate.points[seen.point[rows]], seen.camera[rows], rotation[rows], centre[rows]
     )  # fmt: skip
     away = point - from_here
-    middle = _by_camera(project, estimate, camera, np.einsum("nij,nj->ni", turn, away)[:, None], 2)
+    middle = by_camera(project, estimate, camera, np.einsum("nij,nj->ni", turn, away)[:, None], 2)
     pixels = middle + grid * steps_px(seen)[rows, None, None]
-    rays = _by_camera(unproject, estimate, camera, pixels, 3)
+    rays = by_camera(unproject, estimate, camera, pixels, 3)
     rays = np.einsum("nji,nkj->nki", turn, rays)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (away * normal).sum(1)[:, None] / np.einsum("nkj,nj->nk", rays, normal)
@@ -127,7 +142,7 @@ def steps_px(seen: Observations) -> FloatArray:
     return np.maximum(LEAST_STEP_PX, STEP_OF_SCALE * scale)
 
 
-def _by_camera(
+def by_camera(
     how: object, estimate: Estimate, camera: IntArray, values: FloatArray, width: int
 ) -> FloatArray:
     """`project` or `unproject` of values (n, k, ...) through the camera (n,) of each."""
