@@ -169,7 +169,7 @@ def findings_of(cases: Sequence[Case]) -> Iterator[Finding]:
                 near = met is not True and within_reference(cases, kind, one)
                 wanted = f"{one.least:g} times smaller" if one.least > 1 else "no larger"
                 note = ", within the reference's own sigma" if near else ""
-                yield Finding(scans, kind, one.what, wanted, found, met or near, note)
+                yield Finding(scans, kind, one.what, wanted, found, near or met, note)
         if rendered:
             yield from _consistency(cases, kind, scans)
         yield from _time(cases, kind, scans)

@@ -67,7 +67,7 @@ def refine_tracks(
         on_iteration=lambda iteration, cost: progress("solving roughly", iteration, 0),
     ).problem  # fmt: skip
     paths = [scan.root / one.path for one in scan.images]
-    image = _images_of(rough, scan)
+    image = images_of(rough, scan)
     job = Job(rough, image, paths, graph_options, options.min_parallax_deg, options.device)
     made_of = hashlib.sha256(pickle.dumps(replace(job, paths=()))).hexdigest()
     place = cache.stage(
@@ -81,7 +81,7 @@ def refine_tracks(
     return Refined(final, len(state.good), float(np.median(moved)))
 
 
-def _images_of(problem: Problem, scan: Scan) -> IntArray:
+def images_of(problem: Problem, scan: Scan) -> IntArray:
     """The number in the scan of each observation's image (n_obs,)."""
     number = {(image.camera, image.frame): i for i, image in enumerate(scan.images)}
     frames = [scan.frames.index(name) for name in problem.frame_names]

@@ -10,14 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from synthetic.problems import perturbed
+from synthetic.problems import perturbed, with_tracks
 from synthetic.scans import silent
-from synthetic.walls import CAMERA, Scene, scene
+from synthetic.walls import CAMERA, DISTANCES, NORMALS, Scene, scene
 
 import sfm_calib.refine
 from graphs.build import GraphOptions
 from graphs.frames import FloatArray
-from graphs.problem import Problem, residuals_px
+from graphs.problem import Observations, Problem, residuals_px
 from graphs.refine import refine
 from sfm_calib.cache import Cache
 from sfm_calib.calibrate import checked_scan
@@ -25,9 +25,18 @@ from sfm_calib.cli import main
 from sfm_calib.config import Options
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Scan, ScanImage
-from sfm_calib.patches.rounds import State, medians, to_be_matched
-from sfm_calib.patches.warps import warps_of
-from sfm_calib.refine import Refined, refine_tracks
+from sfm_calib.patches import rounds
+from sfm_calib.patches.rounds import (
+    BENT,
+    Job,
+    State,
+    load_state,
+    match_in_rounds,
+    medians,
+    to_be_matched,
+)
+from sfm_calib.patches.warps import HALF, warps_of
+from sfm_calib.refine import Refined, images_of, refine_tracks
 
 needs_torch = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("torch", "kornia")),
@@ -122,23 +131,83 @@ def test_images_of_something_else_are_refused(tmp_path: Path) -> None:
 
 @needs_torch
 def test_tracks_that_look_different_now_are_matched_again() -> None:
-    one, seen = drawn(), drawn().true.observations
-    state = replace(
-        State.before(one.true),
-        bend=warps_of(one.true.initial, seen, seen.pixels).bend,
-    )
+    one = scene(n_frames=7, n_points=170, scale=9.0)  # what is coarse bends
+    seen = one.true.observations
+    start, points = one.true.initial, one.true.initial.points
+    walls = NORMALS[np.abs(points @ NORMALS.T - DISTANCES).argmin(1)]
+    facing, true = (warps_of(start, seen, seen.pixels, of) for of in (None, -walls))
+    state = replace(State.before(one.true), bend=true.bend, fitted=true.linear)
     assert len(to_be_matched(state, 0)) == len(seen)
     assert not len(to_be_matched(state, 1))
-    points = one.true.initial.points.copy()
-    points[5] *= 0.8  # a fifth nearer: seen from other sides
-    moved = replace(one.true, initial=replace(one.true.initial, points=points))
-    again = to_be_matched(replace(state, now=moved), 2)
-    np.testing.assert_array_equal(again, np.flatnonzero(seen.point == 5))
+    # matched as if the walls faced the cameras, and how patches had to be changed tells otherwise
+    again = to_be_matched(replace(state, bend=facing.bend), 2)
+    off = HALF**2 * np.abs(true.bend - facing.bend).max((1, 2))
+    of_track = np.zeros(len(points))
+    np.maximum.at(of_track, seen.point, off)
+    clearly, hardly = of_track[seen.point] > 1.1 * BENT, of_track[seen.point] < 0.9 * BENT
+    assert clearly.mean() > 0.1 and hardly.mean() > 0.1
+    assert np.isin(np.flatnonzero(clearly), again).all()
+    assert not np.isin(np.flatnonzero(hardly), again).any()
     lost = np.flatnonzero(seen.point == 9)[0]
     good = np.arange(len(seen)) != lost
     again = to_be_matched(replace(state, good=good), 1)
     np.testing.assert_array_equal(again, np.flatnonzero(seen.point == 9))
     assert not len(to_be_matched(replace(state, good=good), 2))  # once is enough
+
+
+@needs_torch
+def test_what_was_lost_is_looked_for_where_the_cameras_then_show_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keypoints eight pixels off are out of reach, until the others have placed the cameras."""
+    one, scan = drawn(), scan_of(drawn().images, tmp_path)
+    seen = one.problem.observations
+    astray = np.arange(len(seen)) % 9 == 4
+    pixels = seen.pixels + 8.0 * astray[:, None] * [0.6, -0.8]
+    start = perturbed(one.true.initial, 0, 1.5, np.random.default_rng(0))
+    rough = replace(one.problem, initial=start, observations=replace(seen, pixels=pixels))
+    paths = [scan.root / image.path for image in scan.images]
+    job = Job(rough, seen.frame, paths, GraphOptions(), 1.0, "cpu")
+
+    def found(most_rounds: int) -> State:
+        monkeypatch.setattr(rounds, "MOST_ROUNDS", most_rounds)
+        match_in_rounds(job, 2, tmp_path, silent)
+        return load_state(rough, tmp_path)
+
+    first, last = found(1), found(3)
+    assert first.good[~astray].mean() > 0.95 and first.good[astray].mean() < 0.3
+    assert last.good[astray].mean() > 0.9
+    off = np.linalg.norm(last.pixels - one.true.observations.pixels, axis=1)
+    assert np.median(off[astray & last.good]) < 0.6  # a track lies where its keypoints lay
+
+
+@needs_torch
+def test_a_spot_with_two_orientations_is_one_track(
+    once: tuple[Path, Refined], tmp_path: Path
+) -> None:
+    one = drawn()
+    twins = one.problem.observations.subset(one.problem.observations.point < 20)
+    doubled = with_tracks(one.problem, one.true.initial.points[:20], twins)
+    again = refined(replace(one, problem=doubled), tmp_path)
+    ours, without = again.problem.observations, once[1].problem.observations
+    assert len(again.problem.initial.points) == len(once[1].problem.initial.points)
+    assert len(ours) == pytest.approx(len(without), abs=3)
+
+
+def test_an_observation_is_looked_at_in_its_own_image() -> None:
+    """Of a rig whose second camera lacks a frame, in a scan with a frame that was not placed."""
+    one = drawn()
+    images = [(0, 0), (1, 0), (0, 1), (0, 2), (1, 2), (0, 3), (1, 3)]  # camera, frame
+    scan = Scan(
+        Path(), ("a", "b"), (CAMERA.size,) * 2, ("w", "x", "y", "z"),
+        tuple(ScanImage(c, f, f"{c}/{f}.png") for c, f in images),
+    )  # fmt: skip
+    camera, frame = np.array([0, 1, 0, 1, 1]), np.array([2, 1, 0, 2, 0])
+    pixels, point = np.zeros((5, 2)), np.zeros(5, np.int64)
+    seen = Observations(pixels, frame, camera, point)
+    problem = replace(one.problem, observations=seen, frame_names=("w", "y", "z"))
+    named = [scan.images[i].path for i in images_of(problem, scan)]
+    assert named == ["0/3.png", "1/2.png", "0/0.png", "1/3.png", "1/0.png"]
 
 
 def test_a_median_is_that_of_its_label() -> None:

@@ -31,7 +31,7 @@ VERSION = 1  # counted up where something else is found: caches ask
 # What is left out, of rendered scans, errs by half a pixel and more; what is weighed by its own
 # sigma below that does no harm.
 LEAST_LIKENESS = 0.7
-MOST_SIGMA_PX = 0.3
+MOST_SIGMA_PX = 0.5
 # Where the others of a track agree to a thousandth, what is merely alike is something before it:
 # of patches that were covered 17 in 100 pass without this rule, and none of a real scan fails it.
 CLEARLY_UNLIKE, MUCH_MORE = 0.1, 15.0
@@ -39,7 +39,7 @@ FLOOR_PX = 0.01  # of the sigma: what interpolating and a surface's shape leave 
 LEAST_MATCHED = 0.2  # of the observations: of scans that went well nine in ten are
 MOST_ROUNDS = 3
 Values = TypeVar("Values", bound=NDArray[Any])
-BENT = 0.2  # samples at a patch's edge, of what no affine change makes of it
+BENT = 0.05  # samples at a patch's edge, of what no affine change makes of it: a lean of 0.02
 
 
 @dataclass(frozen=True)

@@ -95,13 +95,15 @@ def scene(
     scale: float = 1.5,
     seed: int = 0,
     walls: Walls | None = None,
+    far: bool = False,
 ) -> Scene:
     """Pictures with this sensor noise in grey levels, from places half a metre apart.
 
-    Every point is seen by all frames that have it, four pixels from the border.
+    Every point is seen by all frames that have it, four pixels from the border. far: every second
+    frame is taken from twice as far.
     """
     rng, walls = np.random.default_rng(seed), walls or Walls.drawn(seed)
-    placed = [_place(i, n_frames) for i in range(n_frames)]
+    placed = [_place(i, n_frames, 2.0 if far and i % 2 else 1.0) for i in range(n_frames)]
     clean = [walls.image(t) for t in placed]
     images = [
         np.clip(np.round(c + noise * rng.standard_normal(c.shape)), 0, 255).astype(np.uint8)
@@ -125,10 +127,11 @@ def scene(
     return Scene(true, replace(true, observations=replace(seen, pixels=noisy)), images)
 
 
-def _place(index: int, n_frames: int) -> Transform:
+def _place(index: int, n_frames: int, distance: float) -> Transform:
     """Of a frame on an arc, looking at the back wall's middle, a little rolled."""
     angle = 2 * np.pi * index / n_frames
     centre = np.array([0.7 * np.cos(angle), 0.5 * np.sin(angle), 0.25 * np.sin(2 * angle)])
+    centre = centre * distance + [0.0, 0.0, DISTANCES[0] * (1 - distance)]
     forward = np.array([0.1, 0.1, 3.6]) - centre
     forward /= np.linalg.norm(forward)
     right = np.cross([0.15 * np.sin(3 * angle), 1.0, 0.0], forward)
