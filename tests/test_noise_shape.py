@@ -80,10 +80,10 @@ def test_parts_keep_their_noise_when_they_are_joined_and_split() -> None:
 
 
 def test_the_sigmas_hold_of_observations_that_differ_in_every_way() -> None:
-    """Squared errors over the model covariance, one a degree of freedom, in 20 scans; and what
+    """Squared errors over the model covariance, one a degree of freedom, in 12 scans; and what
     one round sigma for all would lose."""
     nees, errors = [], {True: 0.0, False: 0.0}
-    for seed in range(20):
+    for seed in range(12):
         problem, true = with_shaped_noise(0.2, seed)
         for told in (True, False):
             seen = problem.observations

@@ -86,7 +86,7 @@ def kill_and_resume(folder: Path, kills: int, seeds: int, rng: random.Random) ->
 
 
 def test_killed_and_resumed(tmp_path: Path) -> None:
-    kill_and_resume(tmp_path, 1, 20, random.Random(0))
+    kill_and_resume(tmp_path, 1, 8, random.Random(0))
 
 
 @pytest.mark.slow
