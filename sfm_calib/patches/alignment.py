@@ -70,7 +70,6 @@ class _Batch:
         self.edges = tensor(crops.inside)
         self.middle, self.warp = tensor(crops.middle), tensor(crops.coefficients)
         self.track = torch.from_numpy(np.unique(track, return_inverse=True)[1]).to(device)
-        self.reference = torch.from_numpy(reference).to(device)
         self.n_tracks = int(self.track.max()) + 1
         ends = torch.arange(-HALF - 1, HALF + 2, device=device, dtype=torch.float32)
         y, x = torch.meshgrid(ends, ends, indexing="ij")
@@ -86,7 +85,7 @@ class _Batch:
         self.values = torch.zeros(n, len(self.grid), device=device)
         self.seen = torch.zeros(n, len(self.grid), device=device)
         self.use = torch.ones(n, device=device)  # of each view in the mean
-        self.seed = self.reference
+        self.seed = torch.from_numpy(reference).to(device)
 
     def look(self, rows: Tensor) -> None:
         """Sample the images of these rows where their patches lie now, brightness normalised."""
