@@ -24,6 +24,7 @@ from sfm_calib.cache import Cache
 from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import Progress, Scan, read_scan
+from sfm_calib.learned.choice import check_torch_of
 from sfm_calib.mapping import Mapped, map_scan
 from sfm_calib.nominal import (
     check_config,
@@ -39,7 +40,6 @@ from sfm_calib.refine import refine_tracks
 from sfm_calib.result import Calibration
 from sfm_calib.run import Given, Run
 from sfm_calib.summary import summarise
-from sfm_calib.torch_import import check_torch
 
 FEW_PLACED = 0.5  # of the images: of scans that went well, nine in ten and more are
 FRAMES_TO_JUDGE = 6  # fewer, placed together, do not show how a rig moved through its scan
@@ -87,8 +87,7 @@ def checked_scan(
     scan_path: Path, config: RigConfig, cache: Cache, progress: Progress, watch: Stopwatch
 ) -> Scan:
     """The images of a scan, which the configuration fits."""
-    if config.refine:
-        check_torch("--refine")  # before minutes of mapping
+    check_torch_of(config)  # before minutes of mapping
     with watch.stage("reading images"):
         scan = read_scan(scan_path, cache, config.frames, config.video_frames, progress)
         check_config(config, scan)

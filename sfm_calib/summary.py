@@ -275,7 +275,7 @@ def _provenance(run: Run) -> Provenance:
         version=sfm_calib.__version__,
         versions={"python": platform.python_version()}
         | {name: version(name) for name in LIBRARIES}
-        | (torch_versions() if run.config.features != "sift" else {}),
+        | (torch_versions() if run.config.refine or run.config.features != "sift" else {}),
         command=run.command,
         config=run.config.model_dump(mode="json"),
         seed=run.config.seed,

@@ -20,7 +20,7 @@ from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.images import read_scan
 from sfm_calib.learned import extract, matching
-from sfm_calib.learned.choice import check_choice, choose
+from sfm_calib.learned.choice import check_choice, check_torch_of, choose
 from sfm_calib.learned.extract import LearnedFeatures
 from sfm_calib.simulate.tracks import TrackOptions, simulate_tracks
 
@@ -276,3 +276,14 @@ def test_learned_features_leave_the_main_process_without_torch(tmp_path):
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_device_that_nothing_asks_for_or_nobody_has_is_one_line():
+    with pytest.raises(CalibrationError, match="nothing asks for torch: add --refine"):
+        check_torch_of(RigConfig(device="cuda"))
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    for asked in ({"refine": True}, {"features": "xfeat"}):
+        with pytest.raises(CalibrationError, match="finds no GPU that it can use here"):
+            check_torch_of(RigConfig(device="cuda", **asked))

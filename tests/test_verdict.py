@@ -71,10 +71,15 @@ def run(
     off: dict[str, float] | None = None,
     stated: dict[str, float] = STATED,
     scale: KnownBaseline | None = None,
+    matched_px: float | None = None,
     **own: object,
 ) -> Run:
     """A run without anything to say of it; off: prior sigmas by which parameters come out off."""
     problem = problem_of(frames, kept, *([scale] if scale else []))
+    if matched_px is not None:
+        stated_px = np.full(kept, matched_px)
+        seen = replace(problem.observations, matched_sigma_px=stated_px)
+        problem = replace(problem, observations=seen)
     (camera,) = problem.initial.cameras
     prior = stated_lens_prior(camera, weak_lens_prior(camera), camera.named(), stated, ("cy",))
     moves = np.array([(off or {}).get(name, 0.0) for name in camera.names]) * prior.sigma
@@ -84,6 +89,7 @@ def run(
         estimate=replace(problem.initial, cameras=cameras),
         graph=SimpleNamespace(lens_priors=(prior,)),
         n_rejected=rejected,
+        sigma_px=0.12,
         summary=SimpleNamespace(converged=converged, reason="steps ran out"),
     )
     parts = {
@@ -186,6 +192,8 @@ DOUBTS: list[Doubt] = [
             "without the frames 000012 to 000015 the scan determines nothing",
         ),
     ),
+    ({"matched_px": 0.1}, ()),
+    ({"matched_px": 0.08}, ("matched patches scatter 1.5 times as much as matching says",)),
     ({"ladder": climbed(2)}, ()),
     ({"ladder": climbed(1)}, ("the lens radial is a guess: no frame could be held out",)),
     (

@@ -9,7 +9,7 @@ from sfm_calib.config import RigConfig
 from sfm_calib.errors import CalibrationError
 from sfm_calib.files import sha256
 from sfm_calib.learned.weights import FEATURES, FeatureName, find_features, find_matcher
-from sfm_calib.torch_import import Device, check_torch, torch_versions
+from sfm_calib.torch_import import Device, check_torch, import_torch, torch_versions
 
 VERSION = 1  # counted up where other features are found or matched: caches ask
 # A pair's time of matching, for the nearest descriptors and for LightGlue, by that of SIFT's.
@@ -66,6 +66,19 @@ def check_choice(config: RigConfig) -> None:
             f"weights {config.weights} is given, and features is sift, which needs none: add "
             "--features aliked (or xfeat, disk), or leave the weights out"
         )
+
+
+def check_torch_of(config: RigConfig) -> None:
+    """Raises CalibrationError where torch or its device is asked for in vain."""
+    if config.refine:
+        check_torch("--refine")
+    if config.device == "cuda":
+        if not config.refine and config.features == "sift":
+            raise CalibrationError(
+                "device cuda is where torch computes, and nothing asks for torch: add --refine or "
+                "learned features, or leave the device out"
+            )
+        import_torch("device cuda", config.device)
 
 
 def refuse_learned(config: RigConfig, command: str) -> None:
