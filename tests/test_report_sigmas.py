@@ -311,4 +311,5 @@ def test_noise_by_what_matching_states(case: Case) -> None:
     line = next(trace for trace in figure.data if trace.name == "as stated")
     ends = (matched[0].smallest_px, matched[-1].largest_px)
     assert tuple(line.x) == tuple(line.y) == ends
+    assert figure.layout.xaxis.type == figure.layout.yaxis.type == "log"  # so that it is straight
     assert "stated sigma" in figure.layout.xaxis.title.text

@@ -81,12 +81,10 @@ def noise_figure(known: Classes) -> go.Figure:
             line={"color": "gray", "dash": "dot", "width": 1},
         )  # fmt: skip
     styled(figure, height=330)
-    figure.update_xaxes(
-        title=f"{what}, px",
-        type="log",
-        tickvals=TICKS,
-        ticktext=[f"{tick:g}" for tick in TICKS],
-    )
-    figure.update_yaxes(title="sigma of one coordinate, px", rangemode="tozero")
+    by_powers = {"type": "log", "tickvals": TICKS, "ticktext": [f"{tick:g}" for tick in TICKS]}
+    figure.update_xaxes(title=f"{what}, px", **by_powers)
+    # Both ways alike, where the line of what is stated has to be straight.
+    scale = by_powers if _matched(known) else {"rangemode": "tozero"}
+    figure.update_yaxes(title="sigma of one coordinate, px", **scale)
     figure.update_layout(showlegend=len(known) > 1)
     return figure
