@@ -173,7 +173,7 @@ def _overlapping(scan: Scan, known: dict[int, Camera], nominal: dict[int, Transf
 
 def in_sequence(scan: Scan, counts: dict[Pair, int]) -> bool:
     """Whether most images match the next of their camera."""
-    place = {(image.camera, image.frame): number for number, image in enumerate(scan.images)}
+    place = scan.numbers
     pairs = [
         (number, place[camera, frame + 1])
         for (camera, frame), number in place.items()

@@ -59,6 +59,11 @@ class Scan:
         return f"{self.cameras[image.camera]}/{self.frames[image.frame]}"
 
     @property
+    def numbers(self) -> dict[tuple[int, int], int]:
+        """The number of every image, by its camera and frame."""
+        return {(image.camera, image.frame): i for i, image in enumerate(self.images)}
+
+    @property
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every image, by its path."""
         return {image.path: sha256(self.root / image.path) for image in self.images}

@@ -43,7 +43,7 @@ def shared_view(cameras: Sequence[Camera], cam_from_rig: Sequence[Transform]) ->
 
 def first_pairs(scan: Scan, overlapping: np.ndarray) -> list[Pair]:
     """Sorted pairs of images near in time: of one camera, and of cameras (n, n) that overlap."""
-    place = {(image.camera, image.frame): number for number, image in enumerate(scan.images)}
+    place = scan.numbers
     pairs = set()
     for (camera, frame), number in place.items():
         for other in range(len(scan.cameras)):

@@ -83,7 +83,7 @@ def refine_tracks(
 
 def images_of(problem: Problem, scan: Scan) -> IntArray:
     """The number in the scan of each observation's image (n_obs,)."""
-    number = {(image.camera, image.frame): i for i, image in enumerate(scan.images)}
+    number = scan.numbers
     frames = [scan.frames.index(name) for name in problem.frame_names]
     seen = problem.observations
     pairs = zip(seen.camera, seen.frame, strict=True)

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphs.frames import FloatArray
-from graphs.problem import BoolArray, IntArray
+from graphs.problem import IntArray
 from sfm_calib.patches.crops import LEVELS, SIDE, Crops
-from sfm_calib.patches.sensor_noise import A_PIXEL, HALFWAY, shared_noise
-from sfm_calib.patches.warps import HALF
+from sfm_calib.patches.sensor_noise import A_PIXEL, doubling, shared_noise
+from sfm_calib.patches.warps import HALF, monomials
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,25 +57,21 @@ class Aligned:
 class _Batch:
     """Tensors of one batch, and what is computed of them."""
 
-    def __init__(
-        self, torch: Any, crops: Crops, track: IntArray, reference: BoolArray, device: str
-    ) -> None:
+    def __init__(self, torch: Any, crops: Crops, track: IntArray, device: str) -> None:
         def tensor(values: NDArray[Any]) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(device, torch.float32)
 
         self.torch = torch
-        doubling = tensor(_doubling())
+        between = tensor(doubling(SIDE))
         # Of those rows that `look` is asked for next.
-        self.images = (doubling @ tensor(crops.pixels) @ doubling.T)[:, None]
+        self.images = (between @ tensor(crops.pixels) @ between.T)[:, None]
         self.edges = tensor(crops.inside)
         self.middle, self.warp = tensor(crops.middle), tensor(crops.coefficients)
         self.track = torch.from_numpy(np.unique(track, return_inverse=True)[1]).to(device)
         self.n_tracks = int(self.track.max()) + 1
-        ends = torch.arange(-HALF - 1, HALF + 2, device=device, dtype=torch.float32)
-        y, x = torch.meshgrid(ends, ends, indexing="ij")
-        self.grid = torch.stack([x.ravel(), y.ravel()], 1)  # one sample wider: for the gradients
-        x, y = self.grid.T
-        self.terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+        ends = np.arange(-HALF - 1.0, HALF + 2.0)  # one sample wider: for the gradients
+        x, y = (one.ravel() for one in np.meshgrid(ends, ends))
+        self.grid, self.terms = tensor(np.column_stack([x, y])), tensor(monomials(x, y))
         self.corners = torch.tensor([0, WIDTH + 1, -WIDTH - 2, -1], device=device)
         self.samples = self.grid[(self.grid.abs() <= HALF).all(1)]
         self.window = torch.exp(-(self.samples**2).sum(1) / (2 * HALF**2))
@@ -85,7 +81,7 @@ class _Batch:
         self.values = torch.zeros(n, len(self.grid), device=device)
         self.seen = torch.zeros(n, len(self.grid), device=device)
         self.use = torch.ones(n, device=device)  # of each view in the mean
-        self.seed = torch.from_numpy(reference).to(device)
+        self.seed = torch.zeros(n, dtype=torch.bool, device=device)  # `begin` chooses them
 
     def look(self, rows: Tensor) -> None:
         """Sample the images of these rows where their patches lie now, brightness normalised."""
@@ -186,22 +182,23 @@ class _Batch:
         affine = self.torch.tensor([0.0, 0, 1, 1, 1, 1, 0, 0], device=square.device)
         return affine * square[:, None].clamp(min=1e-3) / (AFFINE_PRIOR * HALF) ** 2
 
-    def cov_shift(self, rows: Tensor, mean: Tensor, px: Tensor) -> Tensor:
+    def cov_shift(self, rows: Tensor, mean: Tensor, px: FloatArray) -> Tensor:
         """Covariance (n, 2, 2) of shifts in samples, of the noise of each image; px (n,) of crops.
 
         How each sample moves its patch, times what noise every two of them share.
         """
         torch = self.torch
         J, _, weight, square = self.fit(rows, mean)
-        H = ((J * weight[..., None]).mT @ J).double()
-        H.diagonal(dim1=1, dim2=2).add_(self.held(square) + 1e-6)
+        H, held = ((J * weight[..., None]).mT @ J).double(), self.held(square)
+        H.diagonal(dim1=1, dim2=2).add_(held + 1e-6)
         moves = torch.linalg.inv(H)[:, :2].float()  # (n, 2, 8)
         each = (moves @ J.mT * weight[:, None]).view(-1, 2, WIDTH, WIDTH)
         spacing = (self.warp[rows, :, 1:3] @ self.linear[rows]).norm(dim=1)  # (n, 2) crop px
-        alike = self.alike(spacing, px.log2().round().long())
+        level = torch.from_numpy(np.log2(px).round().astype(np.int64)).to(spacing.device)
+        alike = self.alike(spacing, level)
         spread = alike[:, 1, None] @ each @ alike[:, 0, None]
         from_noise = each.flatten(2) @ spread.flatten(2).mT
-        believed = moves * self.held(square)[:, None] @ moves.mT
+        believed = moves * held[:, None] @ moves.mT
         own = OF_WEIGHED * square / (1 - self.share()[rows]).clamp(min=0.1)
         return ((from_noise + believed) * own[:, None, None]).double()
 
@@ -267,21 +264,6 @@ class _Batch:
         self.use = self.torch.where(few, self.seed.float(), like)
 
 
-def _doubling() -> FloatArray:
-    """Matrix (2 * SIDE - 1, SIDE) from a row of pixels to one with as many between them.
-
-    By cubic splines. torch's bicubic sampling alone (Keys' kernel with a = -0.75) errs by 0.015 px,
-    more or less by where between the pixels a sample lies; of the doubled image by half of that.
-    """
-    reach = len(HALFWAY) // 2
-    result = np.zeros((2 * SIDE - 1, SIDE))
-    result[::2] = np.eye(SIDE)
-    for row in range(SIDE - 1):
-        for k, share in enumerate(HALFWAY, row - reach + 1):
-            result[2 * row + 1, min(max(k, 0), SIDE - 1)] += share
-    return result
-
-
 def _moments(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean and standard deviation (n, 1) of values (n, k)."""
     total = weight.sum(1, keepdim=True).clamp(min=1e-6)
@@ -289,15 +271,13 @@ def _moments(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return mean, ((values - mean) ** 2 * weight).sum(1, keepdim=True).div(total).sqrt()
 
 
-def align(
-    torch: Any, crops: Crops, track: IntArray, reference: BoolArray, device: str = "cpu"
-) -> Aligned:
-    """Align the patches of whole tracks; track (n,) of each, and whether it is the reference.
+def align(torch: Any, crops: Crops, track: IntArray, device: str = "cpu") -> Aligned:
+    """Align the patches of whole tracks; track (n,) of each.
 
     A view that shows nothing, or nothing like the others, comes out with little likeness.
     """
     with torch.inference_mode():  # a setting of each thread
-        batch = _Batch(torch, crops, track, reference, device)
+        batch = _Batch(torch, crops, track, device)
         moving = torch.arange(len(track), device=device)
         for number in range(STEPS):
             batch.look(moving)
@@ -316,26 +296,19 @@ def align(
 
 
 def _aligned(batch: _Batch, crops: Crops) -> Aligned:
-    torch, every = batch.torch, batch.torch.arange(len(batch.track), device=batch.track.device)
+    every = batch.torch.arange(len(batch.track), device=batch.track.device)
     mean = batch.mean()
-    x, y = batch.shift.double().unbind(1)
-    terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    one, nil = torch.ones_like(x), torch.zeros_like(x)
-    by_sample = torch.stack(
-        [
-            torch.stack([nil, one, nil, 2 * x, y, nil], -1),
-            torch.stack([nil, nil, one, nil, x, 2 * y], -1),
-        ],
-        -1,
-    )  # (n, 6, 2)
-    warp = batch.warp.double()
-    px = torch.from_numpy(crops.px.astype(np.float64)).to(warp.device)
-    pixels = (warp @ terms[..., None])[..., 0] * px[:, None]
-    by_shift = warp @ by_sample @ batch.linear.double() * px[:, None, None]
-    cov = by_shift @ batch.cov_shift(every, mean, px.float()) @ by_shift.mT
+    x, y = shift = batch.shift.double().cpu().numpy().T
+    by_sample = np.zeros((len(x), 6, 2))  # of the monomials
+    by_sample[:, 1, 0] = by_sample[:, 2, 1] = 1.0
+    by_sample[:, 3, 0], by_sample[:, 5, 1] = 2 * x, 2 * y
+    by_sample[:, 4, 0], by_sample[:, 4, 1] = y, x
+    linear = batch.linear.double().cpu().numpy()
+    warp = crops.coefficients * crops.px[:, None, None]
+    by_shift = warp @ by_sample @ linear
     return Aligned(
-        pixels.cpu().numpy(),
-        cov.cpu().numpy(),
-        batch.linear.double().cpu().numpy(),
+        (warp @ monomials(*shift)[..., None])[..., 0],
+        by_shift @ batch.cov_shift(every, mean, crops.px).cpu().numpy() @ by_shift.mT,
+        linear,
         batch.likeness(mean).cpu().numpy(),
     )

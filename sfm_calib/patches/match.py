@@ -65,8 +65,7 @@ def match_patches(sights: Sights, device: Device, progress: Progress) -> Matches
     def matched(rows: IntArray) -> tuple[IntArray, Aligned]:
         part = warps.subset(rows)
         crops = cut_out(sights.images, sights.image[rows], part)
-        is_reference = part.reference == np.arange(len(rows))
-        return rows, align(torch, crops, seen.point[rows], is_reference, device)
+        return rows, align(torch, crops, seen.point[rows], device)
 
     batches = _batches(seen.point, sights.image, np.flatnonzero(shown), A_BATCH[device])
     # One thread a batch: torch's own wait for each other after every sum, and spin.

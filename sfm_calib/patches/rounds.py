@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -64,10 +65,12 @@ def match_in_rounds(job: Job, n_threads: int, place: Path, progress: Progress) -
     state, images = State.before(job.rough), Images(job.paths)
     with at_most(n_threads):
         for number in range(MOST_ROUNDS):
+            if number:
+                state = solved(state, job)
             rows = to_be_matched(state, number)
             if not rows.size:
                 break
-            state = solved(matched(state, rows, images, job, progress), job)
+            state = matched(state, rows, images, job, progress)
     np.savez(place / FILE, pixels=state.pixels, cov_px=state.cov_px, good=state.good)
 
 
@@ -95,6 +98,7 @@ class State:
         good = np.ones(len(seen), dtype=bool)
         return State(replace(rough, observations=seen), seen.pixels, square, bend, square, good)
 
+    @cached_property
     def normals(self) -> FloatArray:
         """Of the surfaces (n_points, 3), as far as patches were matched."""
         fitted = np.where(self.good[:, None, None], self.fitted, np.nan)
@@ -119,7 +123,7 @@ def to_be_matched(state: State, number: int) -> IntArray:
     if number == 0:
         return np.arange(len(state.good))
     point, n_points = state.now.observations.point, len(state.now.initial.points)
-    after = warps_of(state.now.initial, state.now.observations, state.pixels, state.normals())
+    after = warps_of(state.now.initial, state.now.observations, state.pixels, state.normals)
     change = HALF**2 * np.abs(after.bend - state.bend).max((1, 2))
     odd = state.good & (change > BENT)
     if number == 1:
@@ -138,7 +142,7 @@ def matched(state: State, rows: IntArray, images: Images, job: Job, progress: Pr
     now, seen = state.now, state.now.observations.subset(rows)
     projected = seen.pixels + residuals_px(now.initial, seen)
     middle = np.where(state.good[rows, None], state.pixels[rows], projected)
-    sights = Sights(now.initial, seen, middle, state.normals(), job.image[rows], images)
+    sights = Sights(now.initial, seen, middle, state.normals, job.image[rows], images)
     found = match_patches(sights, job.device, progress)
     good = _put(state.good, rows, is_good(found, seen.point))
     if good.mean() < LEAST_MATCHED:

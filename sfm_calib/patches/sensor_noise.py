@@ -55,15 +55,27 @@ def shared_noise(n_levels: int) -> FloatArray:
 def _kernel() -> FloatArray:
     """What a sample takes of a pixel, A_PIXEL to a pixel: doubled by splines, then bicubic."""
     reach = len(HALFWAY) + 4
-    doubled = np.zeros(2 * reach + 1)
-    doubled[reach] = 1.0
-    odd = reach + 2 * np.arange(len(HALFWAY)) - len(HALFWAY) + 1
-    doubled[odd] = HALFWAY
+    doubled = doubling(reach + 1)[:, reach // 2]
     fine = np.arange(-reach * A_PIXEL // 2, reach * A_PIXEL // 2 + 1) * 2 / A_PIXEL
     far = np.abs(fine[:, None] - (np.arange(len(doubled)) - reach))
     near = (KEYS + 2) * far**3 - (KEYS + 3) * far**2 + 1
     next_to = KEYS * (far**3 - 5 * far**2 + 8 * far - 4)
     result: FloatArray = np.where(far <= 1, near, np.where(far < 2, next_to, 0.0)) @ doubled
+    return result
+
+
+@cache
+def doubling(n: int) -> FloatArray:
+    """Matrix (2 n - 1, n) from a row of pixels to one with as many between them.
+
+    By cubic splines. torch's bicubic sampling alone (Keys' kernel with a = -0.75) errs by 0.015 px,
+    more or less by where between the pixels a sample lies; of the doubled image by half of that.
+    """
+    result = np.zeros((2 * n - 1, n))
+    result[::2] = np.eye(n)
+    for row in range(n - 1):
+        for k, share in enumerate(HALFWAY, row - len(HALFWAY) // 2 + 1):
+            result[2 * row + 1, min(max(k, 0), n - 1)] += share
     return result
 
 
